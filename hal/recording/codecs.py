@@ -297,27 +297,30 @@ class PictureStats:
         return {key: value.reshape(3, 1, 1) for key, value in found.items()} | {"count": np.array([self._pictures])}
 
 
-def merge_stats(old: Mapping[str, Any] | None, new: Stats) -> Stats:
-    """Return the statistics of both parts together: exact except for the quantiles, which are averaged by row count."""
-    if not old:
-        return new
-    before = {key: np.asarray(value, np.float64) for key, value in old.items()}
-    n, m = float(before["count"][0]), float(new["count"][0])
-    weights = np.array([n, m]) / max(1.0, n + m)
+def merge_stats(parts: Sequence[Mapping[str, Any]]) -> Stats:
+    """Return the statistics of several parts together: exact but for the quantiles, which are averaged by row count.
 
-    def average(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-        both = weights[0] * a + weights[1] * b
-        return np.where(np.isnan(a), b, np.where(np.isnan(b), a, both))
+    A number that a part does not know (NaN) does not count.
+    """
+    if len(parts) == 1:
+        return {key: np.asarray(value) for key, value in parts[0].items()}
+    stacked = {key: np.array([part[key] for part in parts], np.float64) for key in parts[0]}
+    rows = stacked["count"].reshape(-1, *(1,) * (stacked["mean"].ndim - 1))
 
-    mean = average(before["mean"], new["mean"])
-    square = average(before["std"] ** 2 + before["mean"] ** 2, new["std"] ** 2 + new["mean"] ** 2)
+    def average(values: NDArray[Any]) -> NDArray[Any]:
+        weights = rows * ~np.isnan(values)
+        with np.errstate(invalid="ignore"):
+            found: NDArray[Any] = (weights * np.nan_to_num(values)).sum(axis=0) / weights.sum(axis=0)
+        return found
+
+    mean = average(stacked["mean"])
     return {
-        "min": np.fmin(before["min"], new["min"]),
-        "max": np.fmax(before["max"], new["max"]),
+        "min": np.fmin.reduce(stacked["min"]),
+        "max": np.fmax.reduce(stacked["max"]),
         "mean": mean,
-        "std": np.sqrt(np.maximum(0.0, square - mean**2)),
-        **{key: average(before[key], new[key]) for key in _QUANTILES},
-        "count": np.array([int(n + m)]),
+        "std": np.sqrt(np.maximum(0.0, average(stacked["std"] ** 2 + stacked["mean"] ** 2) - mean**2)),
+        **{key: average(stacked[key]) for key in _QUANTILES},
+        "count": stacked["count"].sum(axis=0).astype(np.int64),
     }
 
 

@@ -214,6 +214,19 @@ class Episode:
             return self._each(path, iter(reader), reader.shape)
         return self._each(path, (units.astype(np.int32) - 1 for units in reader.units()), reader.shape)
 
+    def frame(self, camera: str, row: int) -> NDArray[np.uint8]:
+        """Return the colour picture (H, W, 3) RGB of one row; at most one other one is decoded.
+
+        Raises DeviceNotFound if none was recorded, and IndexError if there is no such row.
+        """
+        path = self._file_of(camera, "color")
+        own = range(self.length)[row]
+        with dataset_errors(self._layout.root, path, self.number):
+            found = next(read_video(path, self.first_picture(path) + own, self.fps), None)
+        if found is None:
+            raise self._wrong(path, f"has no picture of row {own}")
+        return found
+
     def _file_of(self, camera: str, stream: str) -> Path:
         """Return the file of a stream. Raises DeviceNotFound if it was not recorded."""
         files = self.files(camera)

@@ -36,6 +36,7 @@ from .layout import (
     ACTION,
     CHUNK,
     GRID,
+    GROUP,
     MOVES,
     SETPOINT,
     SOURCE,
@@ -132,7 +133,9 @@ def entry_row(
     for name, camera in about["cameras"].items():
         row |= {f"camera_matrix/{name}": camera["K"], f"camera_distortion/{name}": camera["distortion"]}
     for key, found in stats.items():
-        row |= {f"stats/{key}/{name}": np.asarray(value).tolist() for name, value in found.items()}
+        row |= {
+            f"stats/{key}/{name}": value if isinstance(value, list) else value.tolist() for name, value in found.items()
+        }
     return row
 
 
@@ -149,14 +152,14 @@ def entries_table(rows: Sequence[Mapping[str, Any]]) -> Any:
     return pa.table({name: pa.array([row[name] for row in rows], types.get(name)) for name in rows[0]})
 
 
-def write_table(path: Path, table: Any) -> None:
-    """Write a Parquet file, whole or not at all."""
+def write_table(path: Path, table: Any, *, keep_schema: bool = False) -> None:
+    """Write a Parquet file, whole or not at all; ``keep_schema`` with the metadata of the schema."""
     import pyarrow.parquet as pq
 
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
-    pq.write_table(table, beside, use_dictionary=False, write_statistics=False)
+    pq.write_table(table, beside, use_dictionary=False, write_statistics=False, store_schema=keep_schema)
     sync_to_disk(beside)
     beside.replace(path)
     sync_to_disk(path.parent)
@@ -237,14 +240,13 @@ def _check_no_links(partial: Path) -> None:
 
 
 def _move(layout: DatasetLayout, partial: Path) -> int:
-    shared = {layout.info, layout.stats, layout.tasks}
     moves = []
     for source, target in read_json(partial / MOVES):
         here, there = partial / source, layout.target(target)
         if Path(source).is_absolute() or ".." in Path(source).parts:
             raise ValueError(f"{source!r} is not a file of this folder")
         if here.exists():
-            if there.exists() and there not in shared:
+            if there.exists() and not there.is_relative_to(layout.info.parent):
                 raise DatasetError(
                     "belongs to a finished episode; it is not overwritten", file=target, code="would_overwrite"
                 )
@@ -278,7 +280,7 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
     t_start = float(rest.rows[0, _place(about["columns"], GRID)])
     columns = _columns(rest, t_start)
     rows = len(rest.rows)
-    closed = _about(rest, number, t_start, recovered) | place.as_json()
+    closed = _about(rest, number, t_start, recovered)
     columns |= {
         "intervention": interventions(columns),
         "next.success": last_row(rows, closed["success"] is True),
@@ -302,16 +304,18 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
             made.append((video, layout.video(name, place.video(name)[0])))
         for name in camera.depths:
             made.append((rest.folder / f"{name}.depth", layout.depth(name, number)))
-    write_json(final / "about.json", closed)
+    place, entries = _continued(layout, closed, place, start, fps, stats)
+    write_json(final / "about.json", closed | place.as_json())
     made.append((final / "about.json", layout.about(number)))
 
-    write_table(final / "entry.parquet", entries_table([entry_row(closed, place, start, fps, stats)]))
+    write_table(final / "entry.parquet", entries)
     made.append((final / "entry.parquet", layout.entry(place.entry)))
     pq.write_table(tasks_table(tasks), final / "tasks.parquet")
     made.append((final / "tasks.parquet", layout.tasks))
     before = read_json(layout.stats) if layout.stats.exists() else {}
     write_json(
-        final / "stats.json", stats_as_lists({key: merge_stats(before.get(key), found) for key, found in stats.items()})
+        final / "stats.json",
+        stats_as_lists({key: merge_stats([*filter(None, [before.get(key)]), found]) for key, found in stats.items()}),
     )
     made.append((final / "stats.json", layout.stats))
     total = {"total_episodes": number + 1, "total_frames": start + rows, "total_tasks": len(tasks)}
@@ -321,6 +325,31 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         sync_to_disk(source)
     sync_to_disk(final)
     return [(str(source.relative_to(rest.folder)), str(target.relative_to(layout.root))) for source, target in made]
+
+
+def _continued(
+    layout: DatasetLayout,
+    about: Mapping[str, Any],
+    place: EpisodePlace,
+    start: int,
+    fps: int,
+    stats: Mapping[str, Stats],
+) -> tuple[EpisodePlace, Any]:
+    """Return a new episode's place and its file of ``meta/episodes``: the last one with one more row, or a new one.
+
+    That is part of the index, which :func:`repair` makes anew, and not of a finished episode.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    before = place._replace(entry=place.entry - 1)
+    path = layout.entry(before.entry)
+    if place.entry > 0 and path.exists():
+        table = pq.read_table(path)
+        more = entries_table([entry_row(about, before, start, fps, stats)])
+        if len(table) < GROUP and set(table.column_names) == set(more.column_names):
+            return before, pa.concat_tables([table, more.select(table.column_names).cast(table.schema)])
+    return place, entries_table([entry_row(about, place, start, fps, stats)])
 
 
 def last_row(rows: int, value: bool) -> NDArray[np.bool_]:
@@ -478,7 +507,7 @@ def _rebuild(layout: DatasetLayout) -> int:
         if path not in known:
             raise DatasetError("belongs to no episode in episodes/", file=str(path.relative_to(layout.root)))
     tasks: dict[int, str] = {}
-    total: dict[str, Stats] = {}
+    parts: dict[str, list[Stats]] = {}
     entries: dict[int, list[dict[str, Any]]] = {}
     start = 0
     for episode in episodes:
@@ -490,14 +519,15 @@ def _rebuild(layout: DatasetLayout) -> int:
         about = episode.info | {"episode": episode.number}
         row = entry_row(about, episode.place, start, episode.fps, stats)
         entries.setdefault(episode.place.entry, []).append(row)
-        total = {key: merge_stats(total.get(key), found) for key, found in stats.items()}
+        for key, found in stats.items():
+            parts.setdefault(key, []).append(found)
         start += episode.length
     for file, rows in entries.items():
         write_table(layout.entry(file), entries_table(rows))
     if sorted(tasks) != list(range(len(tasks))):
         raise DatasetError(f"the episodes have tasks of the numbers {sorted(tasks)}", file="data")
-    write_table(layout.tasks, tasks_table([tasks[k] for k in sorted(tasks)]))
-    write_json(layout.stats, stats_as_lists(total))
+    write_table(layout.tasks, tasks_table([tasks[k] for k in sorted(tasks)]), keep_schema=True)
+    write_json(layout.stats, stats_as_lists({key: merge_stats(found) for key, found in parts.items()}))
     counts = {"total_episodes": count, "total_frames": start, "total_tasks": len(tasks)}
     write_json(layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
     return count

@@ -314,7 +314,7 @@ class _Builder:
     def build(self, on_episode: Callable[[int, int], object]) -> None:
         """Write everything, ``info.json`` last."""
         count = len(self.sources)
-        total: dict[str, Stats] = {}
+        parts: dict[str, list[Stats]] = {}
         self.layout.episodes.mkdir(parents=True)
         with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:  # the libraries release the lock
             try:
@@ -322,15 +322,16 @@ class _Builder:
                 self._places = dict(zip(names, pool.map(self._join_videos, names), strict=True))
                 done = 0
                 for found in pool.map(self._add_group, range(0, count, GROUP)):
-                    for stats in found:
-                        total = {key: merge_stats(total.get(key), each) for key, each in stats.items()}
+                    for key in found[0]:
+                        parts.setdefault(key, []).append(merge_stats([stats[key] for stats in found]))
+                    for _ in found:
                         done += 1
                         on_episode(done, count)
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-        write_table(self.layout.tasks, tasks_table(self.tasks))
-        write_json(self.layout.stats, stats_as_lists(total))
+        write_table(self.layout.tasks, tasks_table(self.tasks), keep_schema=True)
+        write_json(self.layout.stats, stats_as_lists({key: merge_stats(found) for key, found in parts.items()}))
         info = new_info(self.features, self.fps, self.sources[0].episode._meta["robot_type"])
         counts = {"total_episodes": count, "total_frames": self.starts[-1], "total_tasks": len(self.tasks)}
         write_json(self.layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
@@ -390,7 +391,7 @@ class _Builder:
 
     # Rows, index, metadata and depth.
 
-    def _add_group(self, begin: int) -> list[dict[str, Stats]]:
+    def _add_group(self, begin: int) -> list[dict[str, Any]]:
         """Write the files of :data:`GROUP` episodes, but not their videos; return their statistics."""
         group, numbers = begin // GROUP, range(begin, min(begin + GROUP, len(self.sources)))
         data = self.layout.data(group)
@@ -404,6 +405,8 @@ class _Builder:
         for number in numbers:
             _, episode, label = self.sources[number]
             stats = self._stats(number)
+            if kept is None:
+                stats |= {key: column_stats(values[:, None]) for key, values in self._changed(number).items()}
             first = self.starts[number] - self.starts[begin]
             place = EpisodePlace(group, (group, first), {name: at[number] for name, at in self._places.items()})
             about = episode.info | {"episode": number} | label._asdict() | place.as_json()
@@ -443,22 +446,20 @@ class _Builder:
         }
         return {key: values for key, values in found.items() if key in self.features}
 
-    def _stats(self, number: int) -> dict[str, Stats]:
-        """Return the statistics of an episode's columns and videos, from the index of its part."""
+    def _stats(self, number: int) -> dict[str, Any]:
+        """Return the statistics of an episode's columns and videos as its part's index has them."""
         episode = self.sources[number].episode
         if episode.rows is not None:
-            return stats_of(episode) | {
-                key: column_stats(values[:, None]) for key, values in self._changed(number).items()
-            }
-        stats: dict[str, Stats] = {}
+            return dict(stats_of(episode))
+        stats: dict[str, Any] = {}
         for name, value in self._entry(number).items():
             if name.startswith("stats/"):
                 _, key, what = name.split("/")
-                stats.setdefault(key, {})[what] = np.array(value)
+                stats.setdefault(key, {})[what] = value
         if missing := [key for key in self.features if key not in stats]:
             file = episode._layout.entry(episode.place.entry).relative_to(episode._layout.root)
             raise DatasetError(f"has no statistics of {', '.join(missing)}", file=str(file), episode=episode.number)
-        return stats | {key: column_stats(values[:, None]) for key, values in self._changed(number).items()}
+        return stats
 
     def _kept_rows(self, numbers: range) -> Path | None:
         """Return the file that holds the rows of just these episodes as they are to be; None if there is none."""

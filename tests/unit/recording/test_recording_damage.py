@@ -46,20 +46,22 @@ def rig() -> Iterator[Rig]:
         yield opened
 
 
-EACH = 3 + 2 + 2
-"""Files of an episode: rows, entry and own file, two videos, two of depth."""
+EACH = 2 + 2 + 2
+"""Files of an episode: rows and own file, two videos, two of depth."""
+INDEX = 4
+"""Files of the index."""
 
 
 def files(root: Path, episodes: Sequence[int] = (0, 1, 2)) -> list[Path]:
     """Return the files of the index, and those of some episodes."""
     found = sorted(path for path in root.rglob("*") if path.is_file() and path.name != ".lock")
-    assert len(found) == 3 + 3 * EACH
+    assert len(found) == INDEX + 3 * EACH
     return [path for path in found if number_of(path) in (None, *episodes)]
 
 
 def number_of(path: Path) -> int | None:
     """Return the number of the episode that a file belongs to; None for the index."""
-    return int(path.stem[-3:]) if path.stem[-3:].isdecimal() else None
+    return int(path.stem[-3:]) if path.stem[-3:].isdecimal() and "meta" not in path.parts else None
 
 
 # What reads a dataset.

@@ -25,6 +25,7 @@ from hal.recording import (
 )
 from hal.recording.checking import check_dataset
 
+pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 RENUMBERED = {"episode_index", "index", "task_index"}
 
@@ -216,9 +217,12 @@ def make_old(root: Path) -> None:
     for path in root.glob("data/*/*"):
         table = pq.read_table(path).drop(list(new))
         pq.write_table(table.rename_columns([older(name) for name in table.column_names]), path)
-    for path in root.glob("meta/episodes/*/*"):
+    for path in root.glob("meta/episodes/*/*"):  # one file; it was one for each episode
         table = pq.read_table(path)
         gone = [name for name in table.column_names if name.split("/")[1:2] and name.split("/")[1] in new]
         gone += ["success", "dropped", *(name for name in table.column_names if name.startswith("camera_"))]
         table = table.drop(gone)
-        pq.write_table(table.rename_columns([older(name) for name in table.column_names]), path)
+        table = table.rename_columns([older(name) for name in table.column_names])
+        for number in range(len(table)):
+            row = table.slice(number, 1).to_pydict() | {"meta/episodes/file_index": [number]}
+            pq.write_table(pa.table(row), path.with_name(f"file-{number:03d}.parquet"))
