@@ -102,6 +102,7 @@ def parser() -> argparse.ArgumentParser:
     trimming.add_argument("--dry-run", action="store_true", help="only print what would be removed")
     trimming.add_argument("--yes", action="store_true", help="do not ask")
 
+    add("pack", "join the files of episodes, which recorders do from 100 on").add_argument("dataset", metavar="DATASET")
     add("check", "compare every file with the index").add_argument("dataset", metavar="DATASET")
     add("repair", "finish interrupted episodes, and rebuild a lost index").add_argument("dataset", metavar="DATASET")
     return made
@@ -113,7 +114,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(args: argparse.Namespace) -> int:
-    from hal.recording import Dataset, delete_episodes, extract, mark_episodes, merge, set_task, split
+    from hal.recording import Dataset, delete_episodes, extract, mark_episodes, merge, pack, set_task, split
     from hal.recording.exporters.content import select_episodes
 
     if args.command == "merge":
@@ -124,6 +125,9 @@ def _main(args: argparse.Namespace) -> int:
         from hal.apps import review
 
         return review.main([args.dataset, f"--{args.command}"])
+    if args.command == "pack":
+        print(f"{args.dataset}: {_many(pack(args.dataset))}, joined")
+        return 0
     dataset = Dataset(args.dataset)
     if args.command == "list":
         _list(dataset, args)

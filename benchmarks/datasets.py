@@ -92,12 +92,13 @@ def main() -> None:
     args = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
     overrides = [f"cameras.{name}.output.{side}={64}" for name in CAMERAS for side in ("width", "height")]
-    folder = Path(tempfile.mkdtemp(dir="."))
+    folder = Path(tempfile.mkdtemp())
     try:
         with hal.open("panda_table", driver="mock", overrides=overrides) as rig:
             record(rig, folder / "part", RECORDED)
             files = [path for path in (folder / "part/meta/episodes").rglob("*") if path.is_file()]
-            print(f"an index of files of its own: {sum(p.stat().st_size for p in files) / len(files) / 1e3:.1f} kB")
+            size = sum(path.stat().st_size for path in files) / RECORDED / 1e3
+            print(f"{RECORDED} episodes as they are recorded: {size:.1f} kB an episode in meta/episodes")
             for episodes in (args.episodes // 10, args.episodes):
                 report(rig, folder / "part", folder, episodes, args.frames)
     finally:

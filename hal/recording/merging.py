@@ -203,12 +203,12 @@ def pack(dataset: str | Path) -> int:
     recorder does it when :data:`LOOSE` of them have come together.
 
     Returns:
-        The number of files of rows.
+        The number of episodes.
 
     Raises:
         As :func:`merge`.
     """
-    return -(-merge([dataset], dataset) // GROUP)
+    return merge([dataset], dataset)
 
 
 LOOSE = 100

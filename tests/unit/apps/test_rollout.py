@@ -171,7 +171,15 @@ def test_a_person_takes_over_and_the_recording_says_when(folder: Path) -> None:
     assert "1 takeover(s)" in done.stdout
     ((begin, end),) = report(folder)["episodes"][0]["interventions"]
     assert 0.3 < end - begin < 0.6
-    about = Dataset(folder / "runs").episodes[0].info
+    episode = Dataset(folder / "runs").episodes[0]
+    grid, columns = episode.stamps["grid"], episode.columns
+    by_hand = columns["intervention"]
+    assert by_hand[(grid > begin + 1e-6) & (grid < end - 1e-6)].all()
+    assert not by_hand[(grid < begin - 1e-6) | (grid > end + 0.03)].any()
+    assert set(columns["source"][by_hand]) == {1}
+    assert set(columns["source"][~by_hand]) == {2}
+    assert columns["next.done"].tolist() == [False] * (episode.length - 1) + [True]
+    about = episode.info
     assert about["result"]["interventions"] == [[begin, end]]
     assert about["t_start"] < begin < end < about["t_start"] + about["length"] / about["fps"] + 0.1
 

@@ -140,7 +140,7 @@ def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
         record(recorder, 0.3, False)
     check_layout(demo)
     assert [episode.place for episode in Dataset(demo).episodes[:4]] == places
-    assert pack(demo) == 2
+    assert pack(demo) == 5
     assert rows.stat().st_ino == before[0], "a full file is linked"
     mark_episodes(demo, {4: True})
     delete_episodes(demo, [1, 2])
