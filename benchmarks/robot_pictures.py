@@ -43,6 +43,13 @@ def draw(robots: dict[str, dict[str, Any]]) -> Image.Image:
     return image.quantize(COLORS, dither=Image.Dither.NONE)
 
 
+def save(picture: Image.Image, name: str) -> None:
+    """Write a picture and print its size."""
+    path = FOLDER / f"{name}.png"
+    picture.save(path, optimize=True)
+    print(f"{path.name}: {path.stat().st_size / 1024:.0f} kB")
+
+
 def main() -> None:
     """Write the pictures and print their sizes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -55,9 +62,11 @@ def main() -> None:
         except ConfigError as error:
             print(f"{model}: left out: {error.problems[0].message}")
             continue
-        path = FOLDER / f"{model}.png"
-        picture.save(path, optimize=True)
-        print(f"{path.name}: {path.stat().st_size / 1024:.0f} kB")
+        save(picture, model)
+        arms = list(entries(model))
+        if len(arms) > 1:
+            same = {entry["arm"]: entry | {"same": arms[0]["arm"]} for entry in arms[1:]}
+            save(draw({arms[0]["arm"]: arms[0], **same}), f"{model}_both")
     print(f"together {sum(path.stat().st_size for path in FOLDER.glob('*.png')) / 1024:.0f} kB")
 
 

@@ -179,6 +179,8 @@ class RobotSpec:
     """Whether the arm or its gripper is real, so that a user must be present (a dead-man, or ``unattended=True``)."""
     emulated: bool = False
     """Whether all its real devices are emulators, so that nothing physical moves."""
+    same: str | None = None
+    """The arm to which the body of their robot belongs, if this is another arm of it: this one is without that body."""
     group: str | None = None
     """Arms with the same one share a process in real time; None for a process of its own."""
     deadline_max: float = 1.0

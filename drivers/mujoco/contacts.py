@@ -103,8 +103,9 @@ def friction_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, 
     for a, b in itertools.combinations(bodies, 2):
         if a.carried or b.carried or not (a.floating or a.movable or b.floating or b.movable):
             continue
+        skip_a, skip_b = a.ignored_by(b), b.ignored_by(a)
         for (k, one), (m, other) in itertools.product(enumerate(a.contacts), enumerate(b.contacts)):
-            if not (a.solids[k] and b.solids[m]):
+            if not (a.solids[k] and b.solids[m]) or k in skip_a or m in skip_b:
                 continue
             soft_one, soft_other = one.contact_stiffness is not None, other.contact_stiffness is not None
             if soft_one == soft_other:
@@ -173,8 +174,12 @@ def find_contacts(
 def deepest_overlap(mujoco: Any, model: Any, data: Any, a: Body, b: Body) -> tuple[float, str, str]:
     """Return how deep two bodies overlap, m, 0 where they are apart, and by which link of each."""
     deepest: tuple[float, str, str] = (0.0, "", "")
-    for link_a, shapes_a in zip(a.links, a.shapes, strict=True):
-        for link_b, shapes_b in zip(b.links, b.shapes, strict=True):
+    solid_a, solid_b = (
+        [(link, one.shapes[k]) for link, k in one.links.items() if k not in one.ignored_by(other)]
+        for one, other in ((a, b), (b, a))
+    )
+    for link_a, shapes_a in solid_a:
+        for link_b, shapes_b in solid_b:
             for one in shapes_a:
                 for other in shapes_b:
                     apart = np.linalg.norm(data.geom_xpos[one] - data.geom_xpos[other])

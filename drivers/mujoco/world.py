@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -179,6 +180,10 @@ class MujocoWorld(SimulatedWorld[Body]):
     def _arrange(self, added: Sequence[Body]) -> None:
         for body in sorted(added, key=lambda body: not body.is_robot):
             build(self._spec, self._plans[body.name])
+        for part, whole, ignored in self._parts(added):
+            for k, m in product(part.links.values(), ignored):
+                first, second = part.link_path(k), whole.link_path(m)
+                self._spec.add_exclude(bodyname1=first, bodyname2=second, name=f"{first}|{second}")
         add_pairs(self._spec, self.bodies.values())
         try:
             model = self._spec.compile()

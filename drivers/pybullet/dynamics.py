@@ -135,6 +135,8 @@ def find_contacts(
 def deepest_overlap(client: PyBulletClient, a: Body, b: Body) -> tuple[float, str, str]:
     """Return how deep two bodies overlap, m, 0 where they are apart, and by which link of each."""
     points = client.getClosestPoints(a.id, b.id, distance=0.0)
+    skip_a, skip_b = a.ignored_by(b), b.ignored_by(a)
+    points = [point for point in points if point[3] not in skip_a and point[4] not in skip_b]
     if not points:
         return 0.0, "", ""
     deepest = min(points, key=lambda point: point[8])
@@ -176,7 +178,8 @@ def apply_force(client: PyBulletClient, force: AppliedForce[Body]) -> None:
 
 def bounding_box(client: PyBulletClient, body: Body) -> tuple[list[float], list[float]]:
     """Return the lower and upper corner (3,) m of the box along the world's axes around all links of a body."""
-    corners = [client.getAABB(body.id, link) for link in body.links.values()]
+    solid = [link for link in body.links.values() if client.getCollisionShapeData(body.id, link)]
+    corners = [client.getAABB(body.id, link) for link in solid or body.links.values()]
     lower = [min(corner[0][axis] for corner in corners) for axis in range(3)]
     upper = [max(corner[1][axis] for corner in corners) for axis in range(3)]
     return lower, upper

@@ -12,6 +12,7 @@ import os
 import tempfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -200,6 +201,9 @@ class PyBulletWorld(SimulatedWorld[Body]):
     def _arrange(self, added: Sequence[Body]) -> None:
         self._attached = AttachedObjects(self.client, self._attachments())
         self._attached.leave_physics(added)
+        for part, whole, ignored in self._parts(added):
+            for link, other in product(part.links.values(), ignored):
+                self.client.setCollisionFilterPair(part.id, whole.id, link, other, 0)
         self._damped = [PassiveJoints(self.client, body) for body in self.bodies.values() if body.damped]
         self._read_layout()
 

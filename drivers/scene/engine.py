@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from hal.errors import NotSupported
@@ -58,6 +59,21 @@ class SimulatedBody:
     def carried(self) -> bool:
         """Whether it is attached to a link of an arm."""
         return isinstance(self.spec, BodySpec) and self.spec.robot is not None
+
+    @cached_property
+    def _trunk(self) -> frozenset[int]:
+        """Numbers of the links of an arm that its own joints do not move, such as a torso."""
+        assert self.urdf is not None
+        own, urdf = set(self.spec.joints) if isinstance(self.spec, RobotSpec) else set(), self.urdf
+        return frozenset(k for link, k in self.links.items() if own.isdisjoint(j.name for j in urdf.above(link)))
+
+    def ignored_by(self, other: SimulatedBody) -> frozenset[int]:
+        """Return the numbers of the links that never touch another body: those of the robot that it is an arm of.
+
+        These would be contacts within one robot, of which engines compute none.
+        """
+        of_this_robot = isinstance(other.spec, RobotSpec) and other.spec.same == self.name
+        return self._trunk if of_this_robot else frozenset()
 
     @property
     def roams(self) -> bool:
@@ -118,7 +134,8 @@ class SceneEngine(WorldDriver, Generic[B]):
     def _arrange(self, added: Sequence[B]) -> None:
         """Complete the world after bodies were added, before they are put home, or removed; ``bodies`` are up to date.
 
-        Objects that are attached (:meth:`_attachments`) leave physics here: they have no weight and touch nothing.
+        Objects that are attached (:meth:`_attachments`) leave physics here: they have no weight and touch nothing. Nor
+        does an arm touch the body of its robot (:meth:`SimulatedBody.ignored_by`).
         """
 
     @abstractmethod
@@ -131,7 +148,10 @@ class SceneEngine(WorldDriver, Generic[B]):
 
     @abstractmethod
     def _deepest_overlap(self, a: B, b: B) -> tuple[float, str, str]:
-        """Return how deep two bodies overlap, m, 0 if they are apart, and by which link of each."""
+        """Return how deep two bodies overlap, m, 0 if they are apart, and by which link of each.
+
+        Links of :meth:`SimulatedBody.ignored_by` do not count.
+        """
 
     @abstractmethod
     def _read_pose(self, body: B, link: int) -> Transform:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -122,6 +122,13 @@ class SimulatedWorld(SceneEngine[B]):
                 found.append((body, arm, self.link(arm, spec.link)))
         return found
 
+    def _parts(self, added: Sequence[B]) -> Iterator[tuple[B, B, frozenset[int]]]:
+        """Yield each new arm of the same robot as another one, that one, and the links of it that it never touches."""
+        for part in added:
+            whole = self.bodies.get(getattr(part.spec, "same", None) or "")
+            if whole is not None:
+                yield part, whole, whole.ignored_by(part)
+
     def _check_overlaps(self) -> None:
         """Refuse arms that overlap at the start: the solver would throw them apart."""
         robots = [body for body in self.bodies.values() if body.is_robot and not self._is_mirrored(body)]
@@ -130,7 +137,7 @@ class SimulatedWorld(SceneEngine[B]):
             depth, link_a, link_b = self._deepest_overlap(a, b)
             if depth > OVERLAP:
                 message = f"starts {depth:.3f} m inside robot {a.name!r} (its {link_b} in {link_a})"
-                remedy = "change its base or initial; a URDF with two arms is loaded whole for every entry: split it"
+                remedy = f"change its base or initial, or add same: {a.name} if both are arms of one robot"
                 problems.append(Problem("simulation", f"robots.{b.name}", f"{message}; {remedy}", "robots_overlap"))
         if problems:
             raise ConfigError(problems)
@@ -280,8 +287,8 @@ class SimulatedWorld(SceneEngine[B]):
         if first is second:
             raise CommandError(f"the distance needs two bodies, not {a!r} twice")
         links_a, links_b = (
-            list(body.links.values()) if link is None else [self.link(body, link)]
-            for body, link in ((first, link_a), (second, link_b))
+            [self.link(body, link)] if link is not None else [*{*body.links.values()} - body.ignored_by(other)]
+            for body, other, link in ((first, second, link_a), (second, first, link_b))
         )
         found = self._distance(first, links_a, second, links_b)
         if found is None:

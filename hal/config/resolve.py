@@ -9,12 +9,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeVar
 
 from .. import registry
 from ..errors import ConfigError
 from ..geometry import Pose
+from ..kinematics.collisions import in_one_place
 from ..kinematics.urdf import read_urdf
 from ..pads.model import pad_model
 from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RobotSpec, WorldSpec
@@ -47,6 +49,7 @@ def resolve(context: Context) -> Plan:
     with suppress(Unknown):
         _check_clock(context)
     _check_rates(context, robots)
+    _check_places(context, robots)
     driver = _world_driver(context)
     bodies: tuple[BodySpec, ...] = ()
     with suppress(Unknown):
@@ -225,6 +228,15 @@ def _check_rates(context: Context, robots: Iterable[RobotSpec]) -> None:
                 "they must be equal"
             )
             context.problem(f"robots.{robot.name}.rate_hz", message, "unequal_rates")
+
+
+def _check_places(context: Context, robots: Iterable[RobotSpec]) -> None:
+    """Refuse arms of one URDF in one place that are not given as those of one robot: each would bring a whole one."""
+    for one, other in combinations(robots, 2):
+        several = context.rig.robots[other.name].arm is not None
+        if several and one.kinematics.urdf == other.kinematics.urdf and in_one_place(one, other):
+            message = f"has the model and the base of robot {one.name!r}: add same: {one.name} if both are arms of one"
+            context.problem(f"robots.{other.name}.same", f"{message} robot, or give it another base", "robots_overlap")
 
 
 def _world_driver(context: Context) -> str | None:

@@ -8,11 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from .. import registry
-from ..kinematics.urdf import TURNING, UrdfModel
+from ..kinematics.composition import divide_urdf
+from ..kinematics.urdf import TURNING, UrdfModel, read_urdf
 from ..specs import (
     Floats,
     GripperSpec,
@@ -64,9 +66,13 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
     urdf: UrdfModel | None = None
     with suppress(Unknown):
         urdf = load_arm(model, file, context.problems, context.warnings)
-    if urdf is not None:
-        context.urdfs[name] = urdf
-        _check_names(model, urdf, file, context.problems)
+    part: UrdfModel | None = None
+    with suppress(Unknown):
+        if urdf is not None:
+            _check_names(model, urdf, file, context.problems)
+            part = _part_of_robot(context, name, config, model, urdf)
+    if part is not None:
+        context.urdfs[name] = part
     with suppress(Unknown):
         context.links[name] = model.links
     simulated = True
@@ -82,8 +88,9 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
     with suppress(Unknown):
         _check_workspace(context, f"{key}.workspace", config)
     with suppress(Unknown):
-        if urdf is not None and limits is not None and home is not None and driver:
+        if urdf is not None and part is not None and limits is not None and home is not None and driver:
             options = options_of(config, model, simulated, driver)
+            base = config.base if config.same is None else context.rig.robots[config.same].base
             shared = options if driver == gripper_driver else {}
             gripper = _gripper(context, name, config, model, gripper_driver, shared)
             real = [] if simulated else [(driver, options)]
@@ -94,17 +101,18 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
                 model=config.model,
                 driver=driver,
                 rate_hz=context.rig.simulation.physics_hz if simulated else config.rate_hz or model.rate_hz,
-                urdf=str(urdf.path),
+                urdf=str(part.path),
                 joints=model.joints,
                 home=home,
                 initial=initial or home,
                 limits=limits,
                 kinematics=_kinematics(model, urdf, limits, home),
-                base_position=config.base.position,
-                base_orientation=config.base.orientation,
+                base_position=base.position,
+                base_orientation=base.orientation,
                 gripper=gripper,
                 workspace=_workspace(config.workspace) if config.workspace is not None else None,
                 payload=_payload(context, key, config, driver, simulated),
+                same=config.same,
                 group=None if simulated else _group_key(driver, options),
                 speed=config.speed,
                 move_speed=config.move_speed,
@@ -147,6 +155,67 @@ def _joint_numbers(
         initial = _initial(context, f"{key}.initial", model, config)
         _check_inside(initial, limits, model.joints, context.source, f"{key}.initial", context.problems)
     return limits, home, initial
+
+
+# Arms of one robot
+
+
+def _part_of_robot(
+    context: Context, name: str, config: RobotConfig, model: RobotModel, urdf: UrdfModel
+) -> UrdfModel | None:
+    """Return the part of a robot that belongs to one of its arms: all of it, unless the rig has others of its arms.
+
+    The arm that the others name has what no arm moves. As that stands still, the parts together move like one body.
+    None, with the problem added, where ``same`` is wrong.
+    """
+    key, first = f"robots.{name}.same", config.same
+    if first is not None and (problem := _wrong_same(context, name, config, first)):
+        context.problem(key, *problem)
+        return None
+    others = [
+        (other, entry)
+        for other, entry in context.rig.robots.items()
+        if other != name and (other == first or entry.same == (first or name))
+    ]
+    if not others:
+        return urdf
+    taken: set[str] = set()
+    for other, entry in others:
+        joints = set(_joints_of(context, other, entry))
+        if shared := sorted(joints & set(model.joints)):
+            if first is not None:  # reported once
+                text = f"robot {other!r} has joint {shared[0]!r} too: arm must be another one"
+                context.problem(f"robots.{name}.arm", text, "conflict")
+            return None
+        taken |= joints
+    try:
+        return read_urdf(divide_urdf(urdf, model.joints, taken, body=first is None), meshes=False)
+    except OSError as error:
+        context.problem(key, f"the part of {urdf.path.name} cannot be written: {error}", "bad_urdf")
+        return None
+
+
+def _wrong_same(context: Context, name: str, config: RobotConfig, first: str) -> tuple[str, str] | None:
+    """Return message and code of what is wrong with the arm that ``same`` names; None if nothing is."""
+    robots = context.rig.robots
+    others = [other for other in robots if other != name]
+    if first not in others:
+        return f"this rig has no other robot {first!r}{nearest(first, others)}", "unknown_robot"
+    if robots[first].same is not None:
+        return f"robot {first!r} names {robots[first].same!r} itself: name one that names none", "conflict"
+    if robots[first].model != config.model:
+        return f"robot {first!r} is another model, {robots[first].model!r}, not {config.model!r}", "conflict"
+    if "base" in config.model_fields_set and config.base != robots[first].base:
+        return f"excludes another base than that of robot {first!r}: leave base out", "conflict"
+    return None
+
+
+def _joints_of(context: Context, name: str, config: RobotConfig) -> tuple[str, ...]:
+    """Return the joints of another arm of the rig; none where its model has problems, which its own entry reports."""
+    quiet = replace(context, problems=Problems())
+    with suppress(Unknown):
+        return quiet.read_model(RobotModel, f"robots.{name}", config, "robots")[0].joints
+    return ()
 
 
 def _kinematics(model: RobotModel, urdf: UrdfModel, limits: LimitsSpec, home: Floats) -> KinematicsSpec:

@@ -244,6 +244,8 @@ class RobotConfig(Device):
     """A name in ``robots/``, or the path of a file of your own."""
     arm: Name | None = None
     """Which arm, where the model has several (``left`` or ``right`` of a ``baxter``)."""
+    same: Name | None = None
+    """Another arm of this rig that is an arm of the same robot; the robot's base is that arm's."""
     base: PoseConfig = PoseConfig()
     """Pose of the base link in the world."""
     initial: JointPositions | None = None

@@ -119,10 +119,8 @@ def guard_arms(group: GroupSpec, units: Mapping[str, GuardedArm], others: Iterab
             if not in_one_place(unit.spec, other[0]):
                 seen.append(other)
             elif name < other[0].name:
-                one_body = unit.spec.urdf == other[0].urdf and unit.spec.joints != other[0].joints
-                why = "are arms of one body" if one_body else "have their bases in one place"
-                remedy = "" if one_body else f": set robots.{other[0].name}.base"
-                notes.append(f"{name} and {other[0].name} {why}, so they are not checked against each other{remedy}")
+                what = f"{name} and {other[0].name} have their bases in one place"
+                notes.append(f"{what}, so they are not checked against each other: set robots.{other[0].name}.base")
         try:
             notes += _guard(unit, seen, spec)
         except NotSupported as error:

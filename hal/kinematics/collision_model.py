@@ -302,7 +302,7 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
     moved_by = reach > 0.0
     names, indices, levers, margins = [], [], [], []
     for i, j in combinations(range(len(place)), 2):
-        (a, _, link_a), (b, _, link_b) = place[i], place[j]
+        (a, joint_a, link_a), (b, joint_b, link_b) = place[i], place[j]
         margin = spec.margin
         if a != 0 and b != 0:  # not of the first arm
             continue
@@ -313,6 +313,8 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
             margin = min(margin, _SHARE_AT_HOME * apart)
         elif a >= 0 and b >= 0 and not spec.arms:
             continue
+        elif 0 in (joint_a, joint_b) and a >= 0 and b >= 0 and _one_robot(arms[a], arms[b]):
+            continue  # each arm's own pairs have the robot's body
         alone = moved_by[i] != moved_by[j]
         if not alone.any():  # neither moves the other: two bases, or a base and a box
             continue
@@ -334,6 +336,11 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
         margins=np.array(margins, float),
         notes=tuple(f"{arms[0][0]}: {note}" for note in loaded[0].notes) if spec.own else (),
     )
+
+
+def _one_robot(one: _Arm, other: _Arm) -> bool:
+    """Return whether two arms are of one URDF in one place."""
+    return one[1].urdf == other[1].urdf and one[2:] == other[2:]
 
 
 def _changed(urdf: str) -> int:

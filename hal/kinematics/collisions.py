@@ -38,7 +38,7 @@ class Collisions:
         robot: The arm.
         spec: What is checked.
         others: The other arms, each with a function that returns its present joint positions (n,), rad. Those whose
-            bases are in the place of this one's are left out.
+            bases are in the place of this one's are left out, unless they are arms of one robot.
 
     Raises:
         NotSupported: The arm has no collision shapes (``code`` is ``no_shapes``), or a mesh cannot be read.
@@ -165,8 +165,9 @@ class Collisions:
 
 
 def in_one_place(one: RobotSpec, other: RobotSpec) -> bool:
-    """Return whether the bases of two arms are in one place, so that they have been given none or are of one body."""
-    return dist(one.base_position, other.base_position) < _SAME_PLACE
+    """Return whether two arms have their bases in one place, so that they have been given none; not arms of a robot."""
+    of_one_robot = (one.same or one.name) == (other.same or other.name)
+    return not of_one_robot and dist(one.base_position, other.base_position) < _SAME_PLACE
 
 
 def _nearest_each(pairs: Iterable[PairDistance]) -> list[PairDistance]:

@@ -1,4 +1,4 @@
-"""Make one URDF of an arm and a tool that has a URDF of its own, and free joints that a file has fixed.
+"""Make one URDF of an arm and a tool, free joints that a file has fixed, and divide the URDF of a robot with two arms.
 
 What is made is kept in the user's cache, named by its contents, because every process of a rig reads the file.
 """
@@ -15,9 +15,9 @@ from pathlib import Path
 
 from ..geometry import Pose
 from .mesh_files import mesh_file
-from .urdf import parse_xml
+from .urdf import UrdfModel, parse_xml
 
-__all__ = ["MountedTool", "compose_urdf"]
+__all__ = ["MountedTool", "compose_urdf", "divide_urdf"]
 
 PREFIX = "tool_"
 """Put before each name of a tool that the arm has too."""
@@ -57,8 +57,45 @@ def compose_urdf(arm: Path, tool: MountedTool | None = None, freed: Collection[s
         joint.set("type", "revolute")
     if tool is not None:
         _mount(root, tool)
+    return _keep(root, arm.stem)
+
+
+def divide_urdf(robot: UrdfModel, joints: Collection[str], others: Collection[str], *, body: bool) -> Path:
+    """Write the URDF of one arm of a robot with several, and return its path.
+
+    Every link of the robot is in the part of one of its arms.
+
+    Args:
+        robot: The whole robot.
+        joints: Joints of the arm.
+        others: Joints of the other arms; all links that they move are left out.
+        body: Whether all that no arm moves is part of this arm. Without it, only the frames up to the arm are.
+
+    Raises:
+        OSError: The file cannot be read, or the cache cannot be written.
+    """
+    root = _with_absolute_files(robot.path)
+    above = {link: list(robot.above(link)) for link in robot.links}
+    movers = {link: {joint.name for joint in found} for link, found in above.items()}
+    own = {link for link, names in movers.items() if not names.isdisjoint(joints)}
+    if body:
+        kept = {link for link, names in movers.items() if names.isdisjoint(others)}
+    else:
+        kept = own | {joint.parent for link in own for joint in above[link]}
+    for part in list(root):
+        child = part.find("child")
+        link = part.get("name") if child is None else child.get("link")
+        if part.tag in ("link", "joint") and link not in kept:
+            root.remove(part)
+        elif part.tag == "link" and not body and link not in own:
+            part[:] = []
+    return _keep(root, robot.path.stem)
+
+
+def _keep(root: ElementTree.Element, stem: str) -> Path:
+    """Write a URDF into the cache, unless it is there, and return its path."""
     data = ElementTree.tostring(root, encoding="utf-8")
-    place = _cache_folder() / f"{arm.stem}-{hashlib.sha256(data).hexdigest()[:16]}.urdf"
+    place = _cache_folder() / f"{stem}-{hashlib.sha256(data).hexdigest()[:16]}.urdf"
     if not place.is_file() or place.read_bytes() != data:
         place.parent.mkdir(parents=True, exist_ok=True)
         unfinished = place.with_name(f"{place.name}.{os.getpid()}")
