@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from specs import panda
 from torque_kit import NOTHING, Driven, N, wheels
 
-from hal.commands import Kind
+from hal.commands import Kind, Session
 from hal.dynamics import Dynamics
 from hal.errors import CommandError, Fault
-from hal.geometry import after_rotation, difference
+from hal.geometry import after_rotation, difference, rotate
 from hal.kinematics.arm import Kinematics
 from hal.servo.controllers import (
     RAMP,
@@ -107,13 +107,27 @@ def test_the_tcp_is_pulled_with_its_stiffness_along_the_base(axis: int) -> None:
 
 
 def test_gains_along_the_tcp_turn_with_it() -> None:
-    """At home the tool's z axis points down, so that the base's z is its -z, and the base's x not its z."""
+    q = HOME + [0.3, 0.2, -0.4, 0.1, 0.5, -0.3, 0.6]
+    pose, jacobian = KINEMATICS.fk_and_jacobian(q)
     controller = OperationalSpace(stiffness=(100.0, 100.0, 1000.0), rotation_stiffness=10.0, frame="tcp")
-    error = [0.01, 0.0, 0.01, 0.0, 0.0, 0.0]
-    force = [100.0 * 0.01, 0.0, 1000.0 * 0.01, 0.0, 0.0, 0.0]
-    down = difference(KINEMATICS.fk(HOME), (*KINEMATICS.fk(HOME)[:3], 1.0, 0.0, 0.0, 0.0))
-    assert np.abs(down).max() < 0.05, "the tool points down"
-    assert Applied(controller).torques(error=error) == pytest.approx(JACOBIAN.T @ force, abs=0.02)
+    law = Applied(controller).law
+    along, across = (rotate(pose[3:], axis) for axis in ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)))
+    for direction, stiffness in ((along, 1000.0), (across, 100.0)):
+        error = [0.01 * x for x in direction] + [0.0] * 3
+        still = (q.tolist(), list(NOTHING), list(NOTHING))
+        inertia = Inertia(DYNAMICS.mass_matrix(q), N, inverted=False)
+        tau = law.torques(q.tolist(), list(NOTHING), still, inertia, jacobian, pose, error).sum(axis=0)
+        assert tau == pytest.approx(jacobian[:3].T @ (stiffness * np.array(error[:3])), abs=1e-9)
+        ease = jacobian[:3] @ inertia.solve(tau)
+        assert law.gain @ ease > 0.9 * np.linalg.norm(law.gain) * np.linalg.norm(ease) > 0.0
+
+
+def test_what_is_too_light_for_the_rate_is_softened() -> None:
+    """Beyond the rate's frequencies, a spring is as soft, and a damper as weak, as one period can bear."""
+    applied, masses = Applied(JointImpedance(stiffness=50.0)), np.full(N, 1e-4)
+    assert applied.torques(lag=[0.1] * N, mass=np.diag(masses)) == pytest.approx(0.1 * 0.9 * masses / DT)
+    soft = Applied(JointImpedance(stiffness=50.0)).torques([1e-4] * N, mass=np.diag(0.1 * masses))
+    assert soft == pytest.approx(1e-4 * 1.5 / DT**2 * 0.1 * masses)
 
 
 def test_position_only_leaves_the_orientation_free() -> None:
@@ -269,7 +283,8 @@ def test_a_set_point_that_is_held_back_continues_at_the_speed_of_the_arm() -> No
     for _ in range(300):
         arm.send([0.3] + [0.0] * 6, Kind.JOINT_VELOCITY)
         arm.tick()
-    assert arm.servo.report.q_set[0] - here[0] <= 0.2 + 1e-3
+    away = difference(KINEMATICS.fk(here), KINEMATICS.fk(arm.servo.report.q_set))
+    assert math.hypot(*away[:3]) <= 0.05 + 1e-3
     assert arm.servo.report.dq_set[0] < 0.1, "it does not move ahead of an arm that does not move"
 
 
@@ -287,6 +302,30 @@ def test_the_jerk_of_a_set_point_is_what_torques_can_follow() -> None:
     arm.servo.close_session()
     arm.run(1.0)
     assert not arm.servo.active
+    arm.servo.open_session(Session(2, 0.3, 0.25, True), arm.inbox())
+    assert arm.servo.smoother.jerk == pytest.approx(SPEC.limits.jerk, rel=1e-4)
+
+
+@CONTROLLERS
+def test_an_arm_that_is_faster_than_it_may_be_trips(controller: Controller) -> None:
+    arm = compliant(controller)
+    fast = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.05 * SPEC.limits.velocity[6]]
+    arm.tamper = lambda reading: reading._replace(dq=fast)
+    arm.tick()
+    assert arm.state == (RobotStatus.TRIPPED, Trip.LIMIT)
+    assert arm.limited & Limited.SPEED
+
+
+def test_torques_change_in_proportion() -> None:
+    arm = compliant(JointImpedance(stiffness=(900.0, 700.0, 500.0, 300.0, 20.0, 20.0, 20.0)))
+    pushed = (arm.q + [0.01, 0.012, 0.014, 0.02, 0.0, 0.0, 0.0]).tolist()
+    arm.tamper = lambda reading: reading._replace(q=pushed, dq=NOTHING)
+    arm.send([0.2] + [0.0] * 6, Kind.JOINT_VELOCITY)
+    for _ in range(3):
+        arm.tick()
+    late = np.abs(np.diff([setpoint.tau for setpoint in arm.given[-4:]], axis=0)) > 0.999 * 990.0 * arm.dt
+    assert late.any()
+    assert late.sum(axis=1).max() == 1
 
 
 def test_a_turn_of_the_tcp_is_the_rotation_vector() -> None:
