@@ -464,6 +464,32 @@ def test_a_new_connection_is_made_for_the_next_episode(rig: Rig) -> None:
         policy.close()
 
 
+def test_an_answer_from_before_a_pause_is_not_used(rig: Rig) -> None:
+    requests: list[int] = []
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        requests.append(1)
+        return stay(request)
+
+    with PolicyServer(infer) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG), latency=0.2)
+        policy.reset()
+
+        def chunk() -> Any:
+            answer = policy(rig.observe(cameras=()))
+            assert isinstance(answer, dict)
+            return answer["panda"][0]
+
+        assert chunk() is None
+        policy.restart()
+        rig.clock.sleep(0.3)
+        assert chunk() is None, "the answer is to a question from before the pause"
+        assert len(requests) == 2
+        rig.clock.sleep(0.3)
+        assert isinstance(chunk(), hal.JointChunk)
+        policy.close()
+
+
 # RoboArena's servers say what they need.
 
 ARENA: dict[str, Any] = {
