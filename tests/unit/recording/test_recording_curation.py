@@ -147,6 +147,11 @@ def test_rows_can_be_chosen_and_metadata_follows(still: Dataset, tmp_path: Path)
     (gap,) = after.info["gaps"]
     assert gap["from_s"] == pytest.approx(0.8 - 0.5, abs=1e-6)
     assert after.info["rig"] == about["rig"]
+    before = Path(shutil.copytree(out, tmp_path / "before"))
+    kept = KeptRows(0, still.episodes[2].length - 2)
+    assert trim(out, {2: kept}) == 2, "only at the end of the last one: no file gets another number"
+    check_kept(Dataset(before).episodes[2], Dataset(out).episodes[2], kept)
+    assert list(check_dataset(Dataset(out))) == []
     with mock_rig() as rig, Recorder(rig, out, fps=20, task="lift") as recorder:
         recorder.start()
         drive(rig, 0.2)
