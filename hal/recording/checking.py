@@ -25,6 +25,7 @@ from .layout import (
     CameraSetup,
     DatasetLayout,
     EpisodePlace,
+    finish_replacement,
     video_names,
 )
 
@@ -222,6 +223,7 @@ def check_compatible(
         DatasetError: The dataset is damaged.
     """
     root = layout.root
+    finish_replacement(root)
     if root.exists() and not root.is_dir():
         raise CommandError(f"{root} is a file; a recording needs a folder", code="foreign_dataset")
     if layout.info.exists() and not layout.numbers():

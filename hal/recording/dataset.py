@@ -23,6 +23,7 @@ from .layout import (
     DatasetLayout,
     EpisodePlace,
     current_key,
+    finish_replacement,
     require_libraries,
     video_key,
 )
@@ -387,6 +388,7 @@ class Dataset:
 
     def __init__(self, out: str | Path) -> None:
         require_libraries()
+        finish_replacement(out)
         layout = DatasetLayout(out)
         foreign = read_foreign(layout) if is_foreign(layout) else None
         info = read_index(layout) if foreign is None else foreign.info

@@ -47,6 +47,7 @@ from .layout import (
     VIDEO_MB,
     DatasetLayout,
     EpisodePlace,
+    finish_replacement,
     lock_dataset,
     read_json,
     require_libraries,
@@ -486,6 +487,7 @@ def _finished(layout: DatasetLayout, partial: Path) -> str:
 
 def _layout(out: str | Path) -> DatasetLayout:
     require_libraries()
+    finish_replacement(out)
     layout = DatasetLayout(out)
     if not layout.root.is_dir():
         raise CommandError(f"there is no folder {layout.root}", code="no_folder")

@@ -42,6 +42,7 @@ __all__ = [
     "VIDEO_MB",
     "current_key",
     "features_of",
+    "finish_replacement",
     "lock_dataset",
     "read_json",
     "require_libraries",
@@ -330,6 +331,10 @@ class DatasetLayout:
             raise ValueError(f"{name!r} leads out of the dataset through a link")
         return path
 
+    def beside(self, what: str) -> Path:
+        """Return a hidden folder beside the dataset, on the same file system."""
+        return self.root.with_name(f".{self.root.name}.{what}")
+
     def remove(self, partial: Path) -> None:
         """Remove a partial folder by renaming it first, so that a crash leaves nothing that looks like an episode."""
         gone = partial.with_suffix(".removed")
@@ -342,6 +347,17 @@ class DatasetLayout:
         """Remove folders whose removal was interrupted."""
         for gone in self.episodes.glob("*.removed"):
             shutil.rmtree(gone, ignore_errors=True)
+
+
+def finish_replacement(out: str | Path) -> None:
+    """Put a dataset back that :func:`~hal.recording.merge` was replacing when it was interrupted, if there is one.
+
+    Everything that opens or makes a dataset calls it first: a new one in this place would hide the old one.
+    """
+    target = DatasetLayout(Path(out).expanduser().resolve())
+    replaced = target.beside("replaced")
+    if replaced.is_dir() and not target.root.exists():
+        replaced.rename(target.root)
 
 
 @contextlib.contextmanager

@@ -43,6 +43,7 @@ from .layout import (
     VIDEO_MB,
     DatasetLayout,
     EpisodePlace,
+    finish_replacement,
     lock_dataset,
     require_libraries,
     video_names,
@@ -109,9 +110,9 @@ def merge(
     """
     require_libraries()
     finish_replacement(out)
-    target = DatasetLayout(out)
-    building, replaced = _beside(target, "merging"), _beside(target, "replaced")
-    layouts = [DatasetLayout(part) for part in parts]
+    target = DatasetLayout(Path(out).expanduser().resolve())  # not through a link: folders beside it are renamed
+    building, replaced = target.beside("merging"), target.beside("replaced")
+    layouts = [DatasetLayout(Path(part).expanduser().resolve()) for part in parts]
     replaces = target.root in [layout.root for layout in layouts]
     if not replaces and target.root.exists() and (not target.root.is_dir() or any(target.root.iterdir())):
         raise CommandError(f"{target.root} exists; choose a new folder", code="output_exists")
@@ -239,19 +240,6 @@ def existing_episodes(dataset: str | Path, episodes: Collection[int]) -> frozens
     if not episodes:
         raise CommandError("no episode was selected", code="no_episodes")
     return frozenset(episodes)
-
-
-def _beside(layout: DatasetLayout, what: str) -> Path:
-    """Return a hidden folder on the same file system."""
-    return layout.root.with_name(f".{layout.root.name}.{what}")
-
-
-def finish_replacement(out: str | Path) -> None:
-    """Put a dataset back that :func:`merge` was about to replace when it was interrupted; do nothing otherwise."""
-    target = DatasetLayout(out)
-    replaced = _beside(target, "replaced")
-    if replaced.is_dir() and not target.root.exists():
-        replaced.rename(target.root)
 
 
 def _sources(

@@ -154,6 +154,27 @@ def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
     assert len(list(demo.glob("videos/*/*/*.mp4"))) == len(CAMERAS)
 
 
+@pytest.mark.parametrize("killed_at", [1, 2])
+def test_a_dataset_survives_a_kill_while_it_is_replaced(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
+) -> None:
+    demo, renames, rename = Path(shutil.copytree(part, tmp_path / "demo")), [0], Path.rename
+
+    def killed(self: Path, target: Path) -> Path:
+        renames[0] += 1
+        if renames[0] == killed_at:
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Path, "rename", killed)
+        pack(demo)
+    assert demo.exists() is (killed_at == 1)
+    with mock_rig() as rig, Recorder(rig, demo, fps=20, task="lift") as recorder:
+        record(recorder, 0.2)
+    assert check_layout(demo)["total_episodes"] == 3, "the recorder continues it"
+
+
 def test_large_videos_are_linked_and_small_ones_joined_up_to_a_size(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,8 +196,11 @@ def test_many_files_are_joined_when_a_recorder_is_closed(
 ) -> None:
     demo = Path(shutil.copytree(part, tmp_path / "demo"))
     monkeypatch.setattr(merging, "LOOSE", 2)
-    with mock_rig() as rig, Recorder(rig, demo, fps=20) as recorder:
+    link = tmp_path / "link"
+    link.symlink_to(demo)
+    with mock_rig() as rig, Recorder(rig, link, fps=20) as recorder:
         record(recorder, 0.2)
+    assert link.is_symlink()
     assert len(list(demo.glob("data/*/*"))) == 1
     assert check_layout(demo)["total_episodes"] == 3
 
