@@ -40,14 +40,17 @@ def bench_of(*models: str, others: bool = False) -> Any:
 
 
 def _bench(entry: dict[str, Any], engine: Engine) -> Iterator[RobotBench]:
+    arms: dict[str, dict[str, Any]] = {"arm": entry}
+    if first := [one for one in ENTRIES if "arm" in entry and one["model"] == entry["model"] and one != entry][:1]:
+        arms = {"other": first[0], "arm": entry | {"same": "other"}}  # the arm without the body of their robot
     try:
-        plan = load({"sim": True, "robots": {"arm": entry}}, engine=engine.name).resolve()
+        plan = load({"sim": True, "robots": arms}, engine=engine.name).resolve()
     except ConfigError as error:
         if all(problem.code == "missing_package" for problem in error.problems):
             pytest.skip(error.problems[0].message)
         raise
     world: Any = registry.load(engine.name, "world")(plan.world)
-    driver: Any = engine.robot(world)
+    driver: Any = engine.robot(world, "arm")
     yield _robot_bench(driver, advance=world.step, joint=0)  # 1 Nm throws the light wrist of a small arm
     driver.close()
     world.close()
