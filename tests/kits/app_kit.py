@@ -41,6 +41,7 @@ def run_here(main: Callable[[list[str]], int], *arguments: object, answer: str =
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("default")
+        warnings.simplefilter("ignore", ResourceWarning)  # of what tests before have left to the garbage collector
         warnings.showwarning = warn
         try:
             status = main([str(argument) for argument in arguments])
