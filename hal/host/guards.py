@@ -139,6 +139,8 @@ def _guard(unit: GuardedArm, others: Sequence[tuple[RobotSpec, Neighbour]], spec
     for k in model.touching():
         pair = model.pair(k, 0.0)
         if unit.spec.name < pair.second.partition("/")[0] or "/" not in pair.second:
-            notes.append(f"{pair.first} and {pair.second} overlap at the start: move one of them")
+            notes.append(
+                f"{pair.first} and {pair.second} overlap at the start: only motions that part them are allowed"
+            )
     unit.servo.set_guard(CollisionGuard(model, unit.servo.smoother, [neighbour for _, neighbour in others]))
     return notes
