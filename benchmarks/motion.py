@@ -100,7 +100,7 @@ def optimal_time(path: JointPath, arm: Kinematics, limits: LimitsSpec, tcp_speed
     return float((2.0 * step / np.maximum(v[1:] + v[:-1], 1e-9)).sum())
 
 
-def lines(count: int = 200, engine: str = "pybullet", seed: int = 1) -> dict[str, Any]:
+def lines(count: int = 200, engine: str = "pybullet", seed: int = 1, controller: Any = None) -> dict[str, Any]:
     """Follow random lines of 5 to 50 cm at 0.25 m/s in the simulated world, each from where the last one ended."""
     numbers = np.random.default_rng(seed)
     rows: dict[str, list[float]] = {"off_set": [], "off": [], "tilt": [], "ratio": [], "length": []}
@@ -122,7 +122,8 @@ def lines(count: int = 200, engine: str = "pybullet", seed: int = 1) -> dict[str
             planner = arm._planner()
             try:
                 (section,) = planner.along_poses(q, [goal]).sections
-                motion = arm.start_move_to(hal.Pose(goal[:3], goal[3:]), straight=True, speed=1.0, tcp_speed=TCP_SPEED)
+                pose, terms = hal.Pose(goal[:3], goal[3:]), {"speed": 1.0, "tcp_speed": TCP_SPEED}
+                motion = arm.start_move_to(pose, straight=True, controller=controller, **terms)
             except (hal.Unreachable, hal.CollisionError):
                 refused += 1
                 continue

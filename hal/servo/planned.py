@@ -263,17 +263,17 @@ class PlannedMotion(ServoMotion):
         """Move an arm at rest back to its path by one tick; returns whether it is there already."""
         smoother = self.smoother
         path, zones = self._sections[self._section]
-        if self._s > 0.0 or self._zone > 0:
-            self._s = path.nearest(smoother.q, self._s)
-            self._zone = next((k for k, zone in enumerate(zones) if self._s < zone.end), len(zones) - 1)
-        q = path.at(self._s)[0]
+        s = path.nearest(smoother.q, self._s) if self._s > 0.0 or self._zone > 0 else self._s
+        q = path.at(s)[0]
         away = max(abs(x - y) for x, y in zip(q, smoother.q, strict=True))
-        if away <= _HERE:
-            return True
         if away > OFF_PATH:
-            self.lost = True
+            self.lost = True  # the progress stays what it was
             smoother.stop()
             return False
+        self._s = s
+        self._zone = next((k for k, zone in enumerate(zones) if s < zone.end), len(zones) - 1)
+        if away <= _HERE:
+            return True
         slowly = [_COMING_BACK * v for v in self.envelope.velocity]
         if not smoother.reach(q, slowly, self.envelope.guard):
             smoother.stop()

@@ -3,7 +3,10 @@
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import hal
 
 BENCHMARK = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "motion.py"))
 
@@ -16,6 +19,37 @@ def test_the_simulated_arm_stays_on_its_line(engine: str) -> None:
     assert found["off"] <= 2e-3
     assert found["tilt"] <= 5e-3
     assert found["ratio"] <= 1.3
+
+
+@pytest.mark.parametrize("controller", [hal.OperationalSpace(), hal.JointImpedance()], ids=["tcp", "joints"])
+def test_a_compliant_arm_stays_on_its_line(controller: hal.OperationalSpace | hal.JointImpedance) -> None:
+    found = BENCHMARK["lines"](1, controller=controller)
+    assert found["off_set"] <= 5e-4
+    assert found["off"] <= 2e-3
+    assert found["tilt"] <= 5e-3
+
+
+def test_a_compliant_arm_waits_at_an_obstacle_until_it_is_gone() -> None:
+    overrides = {"cameras": {}, "objects": ["objects/floor.yaml", "objects/table.yaml"]}
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=overrides) as rig:
+        arm = rig.robots["panda"]
+        start = arm.fk(arm.state().q_set)
+        goal = hal.Pose(start.position + [0.0, 0.2, 0.0], start.orientation)
+        base = hal.Pose(arm.spec.base_position, arm.spec.base_orientation)
+        wall = base @ hal.Pose(start.position + [0.0, 0.23, 0.05], [0.0, 0.0, 0.0, 1.0])
+        sides = (0.15, 0.01, 0.15)
+        rig.world.add(hal.BodySpec("wall", wall.position, wall.orientation, "box", half_extents=sides, fixed=True))
+        motion = arm.start_move_to(goal, straight=True, speed=0.5, controller=hal.OperationalSpace())
+        rig.clock.sleep(2.0)
+        waiting = motion.progress
+        rig.clock.sleep(0.3)
+        assert motion.progress == waiting < 1.0
+        assert 0.01 < np.linalg.norm(arm.state().tcp.position - arm.state().tcp_set.position) < 0.051
+        rig.world.remove("wall")
+        result = motion.wait(10.0)
+        assert result
+        assert hal.Limited.LEAD in result.held_back
+        assert arm.state().tcp.distance(goal)[0] < 1e-3
 
 
 def test_lines_that_are_begun_end_and_those_refused_are_impossible() -> None:

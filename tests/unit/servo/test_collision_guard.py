@@ -119,14 +119,15 @@ def test_far_from_everything_the_set_points_are_the_same_to_the_bit(panda: Robot
     assert checked.track == free.track
 
 
-@pytest.mark.parametrize("inside", [0.004, 0.03])  # m; the margin is 0.01, so the second one overlaps
+@pytest.mark.parametrize("inside", [0.004, 0.015])  # m; the margin is 0.01, so the second one overlaps
 def test_an_arm_that_starts_inside_the_margin_may_only_leave(panda: RobotSpec, inside: float) -> None:
     box = BoxSpec("box", (0.5, 0.0, -0.1), (0.0, 0.0, 0.0, 1.0), (0.3, 0.3, 0.1))
     bench = Bench(panda, CollisionSpec(boxes=(box,)))
     bench.start(OVER_THE_TABLE)
-    box = replace(box, position=(0.5, 0.0, box.position[2] + bench.distance() + inside))  # it is under the hand
-    bench = Bench(panda, CollisionSpec(boxes=(box,)))
-    bench.start(OVER_THE_TABLE)
+    while bench.distance() > 1e-3 - inside:  # raise the box, which is under the hand
+        box = replace(box, position=(0.5, 0.0, box.position[2] + max(1e-3, 0.5 * (bench.distance() + inside))))
+        bench = Bench(panda, CollisionSpec(boxes=(box,)))
+        bench.start(OVER_THE_TABLE)
     before = bench.distance()
     assert before == pytest.approx(-inside, abs=2e-3)
     bench.run(0.4, Kind.TWIST, twist(0.0, 0.0, -0.1))

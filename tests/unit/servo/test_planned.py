@@ -121,10 +121,12 @@ def test_an_arm_beside_its_path_comes_back_to_it_and_one_far_away_does_not() -> 
     bench = bench_of()
     bench.begin()
     bench.run(0.5)
+    progress = bench.servo.report.progress
     bench.q = [x + 0.1 for x in bench.q]
     bench.servo.anchor(bench.q)
     bench.run(1.0)
     assert bench.servo.report.off_path
+    assert bench.servo.report.progress == progress > 0.0
     assert not bench.moving
 
 
