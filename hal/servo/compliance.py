@@ -2,8 +2,8 @@
 
 The set-point is made as ever. Its tcp goes a little slower than the session allows, so that an arm that lags can catch
 up without being faster than that, and its acceleration changes only as fast as torques can. It never leads an arm that
-is held back by more than :data:`LEAD`, so that nothing springs when the arm is let go; :class:`.torque.TorqueBounds`
-keep the arm below the session's tcp speed besides.
+is held back by more than :data:`LEAD`, so that nothing springs when the arm is let go; :mod:`.torque_bounds` keeps the
+arm below the session's tcp speed besides.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from ..specs import RobotSpec
 from ..types import ControlMode, Limited
 from .controllers import Controller, ControllerLaw, Position, controller_of
 from .envelope import Envelope
-from .torque import RATE, Inertia, TorqueMotion
+from .torque import TorqueMotion
+from .torque_bounds import RATE, Inertia
 
 __all__ = ["LEAD", "Compliance"]
 

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arguments import number, vector
 from ..errors import CommandError
 from ..types import ControlMode
-from .torque import RATE, Inertia
+from .torque_bounds import RATE, Inertia
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics

@@ -27,7 +27,7 @@ from hal.servo.controllers import (
     resolve,
     with_gains,
 )
-from hal.servo.torque import Inertia
+from hal.servo.torque_bounds import Inertia
 from hal.types import ControlMode, Limited, RobotStatus, Trip
 
 Array = NDArray[np.float64]

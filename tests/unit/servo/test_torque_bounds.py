@@ -13,7 +13,7 @@ from hal.commands import Session
 from hal.kinematics.arm import Kinematics
 from hal.servo.envelope import Envelope
 from hal.servo.smoothing import JointSmoother
-from hal.servo.torque import RATE, ArmInMotion, Inertia, TorqueBounds
+from hal.servo.torque_bounds import RATE, ArmInMotion, Inertia, TorqueBounds
 from hal.specs import WorkspaceSpec
 from hal.types import Limited
 
