@@ -18,7 +18,7 @@ import threading
 import traceback
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from hal.apps._common import (
     ACTION_NEEDED,
@@ -30,13 +30,14 @@ from hal.apps._common import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.geometry import Pose
     from hal.learning.policy import Policy, PolicyOutcome
     from hal.learning.policy_config import PolicyConfig
+    from hal.learning.takeover import Takeover
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot
@@ -50,6 +51,8 @@ LOAD_TIMEOUT = 300.0
 """Longest time that such a policy may take to load, s."""
 PRINTED_LINES = 20
 """Number of lines of such a server that are part of an error."""
+NOTE_PERIOD = 0.5
+"""Time between two notes to the console on who drives, while that does not change, s."""
 MARKS = {"finish": True, "fail": False}
 """Action of the pad's mapping that ends an episode -> whether it is marked a success, as in ``apps/collect.py``."""
 
@@ -244,11 +247,14 @@ class RolloutRun:
         self.marks = {actions[action]: mark for action, mark in MARKS.items() if action in actions}
         """Button -> how it marks an episode."""
         self.line = StatusLine()
-        takeover = None
+        self.takeover: Takeover | None = None
         if args.takeover and mapping is not None and self.pad is not None:
-            takeover = Takeover(Teleop(self.robot, mapping), self.pad)
+            self.takeover = Takeover(Teleop(self.robot, mapping), self.pad)
         if recorder is not None:
-            recorder.source = lambda: "person" if takeover is not None and takeover.active else "policy"
+            recorder.source = self._driver
+        self.figures: Callable[[], dict[str, Any]] = policy.statistics if isinstance(policy, RemotePolicy) else dict
+        """Returns the figures of a policy on a server."""
+        self._noted, self._next_note = "", 0.0
         self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
             rig,
@@ -262,7 +268,7 @@ class RolloutRun:
             history=args.history,
             success=load_object(args.success, "--success") if args.success else None,
             mark=self._mark,
-            takeover=takeover,
+            takeover=self.takeover,
         )
         self.pressed: set[str] = set()
         """Marking buttons that are pressed. Each press marks once."""
@@ -320,6 +326,8 @@ class RolloutRun:
                 else:
                     result = {"interventions": outcome.interventions, "policy": dict(outcome.statistics)}
                     self.recorder.save(outcome.success, wait=True, result=result)
+        self._noted = ""
+        self._note_driver("")
         self.outcomes.append(outcome)
         self._announce(f"episode {number}: {_describe(outcome)}")
         if self.recorder is not None and (trouble := self.recorder.status().trouble):
@@ -357,6 +365,20 @@ class RolloutRun:
 
     def _show(self, number: int, seconds: float) -> None:
         self.line.update(lambda: f"  episode {number}: {seconds:6.1f} of {self.args.seconds:g} s")
+        driver, now = self._driver(), self.rig.clock.now()
+        if driver != self._noted or now >= self._next_note:
+            self._noted, self._next_note = driver, now + NOTE_PERIOD
+            figures = self.figures()
+            self._note_driver(driver + (f": {_describe_chunks(figures)}" if figures.get("chunks") else ""))
+
+    def _driver(self) -> Literal["person", "policy"]:
+        return "person" if self.takeover is not None and self.takeover.active else "policy"
+
+    def _note_driver(self, note: str) -> None:
+        from hal.views import DrivingView
+
+        if self.rig.console is not None:
+            self.rig.console.show_driving(DrivingView(self.robot.name, note=note))
 
     def _print_results(self, ended: str) -> None:
         done = [outcome.success for outcome in self.outcomes]
@@ -413,14 +435,16 @@ def _describe(outcome: PolicyOutcome) -> str:
     missed = f", {outcome.missed} MISSED" if outcome.missed else ""
     if taken := outcome.interventions:
         missed += f", {len(taken)} takeover(s) of {sum(end - begin for begin, end in taken):.1f} s"
-    if "latency" in (figures := outcome.statistics):
-        latency = {name: _ms(value) or 0.0 for name, value in figures["latency"].items()}
-        late = f", {figures['late']} LATE" if figures["late"] else ""
-        return (
-            f"{text}{missed}; {figures['chunks']} chunk(s){late}, latency p50 {latency['p50']:.0f}, "
-            f"p99 {latency['p99']:.0f} ms"
-        )
+    if "latency" in outcome.statistics:
+        return f"{text}{missed}; {_describe_chunks(outcome.statistics)}"
     return f"{text}{missed}; inference p50 {p50:.1f}, p99 {p99:.1f} ms"
+
+
+def _describe_chunks(figures: Mapping[str, Any]) -> str:
+    """Return the figures of a policy on a server in one line."""
+    p50, p99 = (_ms(figures["latency"][name]) or 0.0 for name in ("p50", "p99"))
+    counts = f"{figures['chunks']} chunk(s), {figures['late']} late, {figures['steep']} steep"
+    return f"{counts}, latency p50 {p50:.0f}, p99 {p99:.0f} ms"
 
 
 if __name__ == "__main__":

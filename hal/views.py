@@ -206,6 +206,8 @@ class DrivingView:
     """Axes that the controls move along, ``base`` or ``tcp``."""
     settings: tuple[str, ...] = ()
     """Those of :data:`SETTINGS` that the page in control may change."""
+    note: str = ""
+    """Who drives at present, in one line, for a program in which not only the pad does."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.speed <= self.speed_max <= 1.0:

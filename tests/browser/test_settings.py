@@ -210,14 +210,16 @@ def test_a_program_that_offers_nothing_has_no_selector(bench: Bench, page: Brows
     from hal.views import DrivingView
 
     try:
-        bench.console.show_driving(DrivingView("right"))
+        bench.console.show_driving(DrivingView("right", note="policy: 3 chunk(s)"))
         wait_for(lambda: names_the_driven(page, "right"), "the page to name the driven arm")
+        assert page.text("#driving-note") == "policy: 3 chunk(s)"
         assert page.text("#robots") == ""
         assert page.text("#reset") == ""
-        assert page.run("return document.querySelector('#speed').disabled")
+        assert page.text("#settings") == ""
     finally:
         bench.session._show_driving()
     wait_for(lambda: names_the_driven(page, "left"), "the page to name the driven arm again")
+    assert page.text("#driving-note") == ""
 
 
 def test_invalid_driving_views() -> None:

@@ -198,7 +198,10 @@ export class Settings {
     setText(byId("driven"), several ? robot : "");
     show(byId("robots"), several && (!lease.mine || this.may("robot")));
     show(byId("reset"), this.may("scene"));
-    show(byId("settings"), this.#view !== null);
+    show(byId("settings"), Boolean(this.#view?.settings.length));
+    const note = this.#view?.note ?? "";
+    setText(byId("driving-note"), note);
+    show(byId("driving"), note !== "");
     if (!this.#view) return;
     const percent = Math.round(100 * this.#view.speed);
     this.speed.max = String(Math.round(100 * this.#view.speed_max));

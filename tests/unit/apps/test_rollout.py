@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -10,12 +11,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from app_kit import CIRCLE, CROSS, PS, SQUARE, Done, run_here, write_pad
 
-from hal.apps.rollout import main
+import hal
+from hal.apps._common import find_deadman
+from hal.apps.rollout import RolloutRun, main, parser
 from hal.recording import Dataset
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -182,6 +186,36 @@ def test_a_person_takes_over_and_the_recording_says_when(folder: Path) -> None:
     about = episode.info
     assert about["result"]["interventions"] == [[begin, end]]
     assert about["t_start"] < begin < end < about["t_start"] + about["length"] / about["fps"] + 0.1
+
+
+def test_pages_show_who_drives_and_the_figures_of_a_policy_while_it_drives(folder: Path) -> None:
+    pytest.importorskip("msgpack")
+    from hal.learning.asynchronous import RemotePolicy
+    from hal.learning.policy_config import load_policy_config
+    from hal.learning.remote import PolicyClient, PolicyServer
+
+    config = load_policy_config(
+        {"rate_hz": 20, "observation": {"state": {"state": "q"}}, "action": {"kind": "joint_position"}}
+    )
+    pad = write_pad(folder, (2.0, "BTN_TL"), until=4.0, held=(0.5, 3.5))
+    args = parser().parse_args(["--policy", "ws://", "--takeover", "--seconds", "2.0"])
+    overrides = ["cameras={}"]
+    with (
+        PolicyServer(lambda request: {"actions": np.tile(request["state"], (16, 1))}) as server,
+        hal.open("panda_table", sim=True, clock="lock_step", pad=pad, overrides=overrides) as rig,
+        contextlib.closing(PolicyClient(server.url)) as client,
+    ):
+        rig.console = console = Mock(spec=["say", "show_driving"])
+        policy = RemotePolicy(rig, client, config, latency=0.1)
+        assert RolloutRun(rig, rig.robots["panda"], args, policy, None, *find_deadman(rig)).run() == 0
+        notes = [call.args[0].note for call in console.show_driving.call_args_list]
+        rig.console = None
+    chunks = [int(found[1]) for note in notes if (found := re.search(r"(\d+) chunk", note))]
+    assert chunks == sorted(chunks)
+    assert len(set(chunks)) > 1
+    assert any(note.startswith("person: ") for note in notes)
+    assert re.fullmatch(r"policy: \d+ chunk\(s\), 0 late, 0 steep, latency p50 1\d\d, p99 1\d\d ms", notes[-2]), notes
+    assert notes[-1] == ""
 
 
 def test_takeover_needs_a_dead_man(folder: Path) -> None:
