@@ -6,6 +6,7 @@ Everything is in the arm's base frame, whose z axis must point up.
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
@@ -257,8 +258,8 @@ def find_by_depth(
         upper: The other corner (3,), m.
         count: Number of frames for each look.
         closer: Whether a camera on the hand looks a second time.
-        **options: :class:`~hal.skills.running.SkillOptions` of the motion between the looks; if it fails, the first
-            look counts.
+        **options: :class:`~hal.skills.running.SkillOptions` of the motion between the looks. If it fails, the first
+            look counts, with a RuntimeWarning if the arm has moved. Stops and faults are exceptions.
 
     Raises:
         CommandError: The camera has no depth, or its pose is unknown.
@@ -266,7 +267,10 @@ def find_by_depth(
     found = locate_by_depth(arm, read_frames(camera, count), lower=lower, upper=upper)
     if found is None or not closer or not is_on_hand(arm, camera):
         return found
-    if not look_at(arm, camera, found.pose.position, **options):
+    looked = look_at(arm, camera, found.pose.position, **options)
+    if not looked:
+        if looked.reason in ("blocked", "timed_out"):
+            warnings.warn(f"the second look failed, the first one counts: {looked.message}", RuntimeWarning, 2)
         return found
     again = locate_by_depth(arm, read_frames(camera, count), lower=lower, upper=upper)
     return found if again is None else again

@@ -75,6 +75,16 @@ def test_a_camera_on_the_hand_looks_from_near(rig: hal.Rig) -> None:
     arm.move_to(arm.home, speed=0.5)
 
 
+def test_what_happens_on_the_way_to_the_second_look_is_reported(rig: hal.Rig) -> None:
+    arm, camera = rig.robots["panda"], rig.cameras["wrist"]
+    with pytest.warns(RuntimeWarning, match="longer than 0.2 s"):
+        assert find_by_depth(arm, camera, count=1, timeout=0.2) is not None
+    with raises_code(hal.MotionStopped, "rig_stop"):
+        find_by_depth(arm, camera, count=1, progress=lambda now: rig.stop())
+    rig.rearm()
+    arm.move_to(arm.home, speed=0.5)
+
+
 def test_what_a_camera_cannot_do_is_refused(rig: hal.Rig) -> None:
     arm, fixed = rig.robots["panda"], rig.cameras["scene"]
     with raises_code(hal.CommandError, "not_on_the_hand"):
