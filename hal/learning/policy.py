@@ -16,6 +16,7 @@ from ..commands import Command, CommandChecks, JointVelocity
 from ..errors import CommandError, ConnectionLost, MotionStopped, PolicyError, RobotFault, StaleStateError
 from ..histogram import Histogram
 from ..observation import Observation
+from ..types import Trip
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -118,7 +119,7 @@ class PolicyOutcome:
     ended: str
     """``success``, ``failure`` (marked by the operator), ``time``, ``stopped`` or ``error``."""
     reason: str
-    """Why it was stopped, or what the policy raised."""
+    """Why it was stopped, with the names of the arms that were if there are several; or what the policy raised."""
     seconds: float
     """Time that the policy drove, without pauses, s."""
     turns: int
@@ -222,15 +223,21 @@ class PolicyRunner:
         tally = _Tally(judged=self._success is not None)
         terms: Any = {"deadman": self._deadman, "rate_hz": self._rate, "unattended": self._unattended}
         controls = {name: robot.control(**terms) for name, robot in self.robots.items()}
+        stopped: list[str] = []
         try:
             with _policy_errors(PolicyError):
                 self._reset(seed)
             if self._takeover is not None:
                 self._takeover.reset()
             with _all_open(controls.values()):
-                self._drive(controls, tally, on_turn)
+                try:
+                    self._drive(controls, tally, on_turn)
+                except (MotionStopped, RobotFault):
+                    stopped = [name for name, control in controls.items() if control.trip is not Trip.NONE]
+                    raise
         except (MotionStopped, RobotFault, ConnectionLost, StaleStateError) as stop:
-            tally.end_as("stopped", getattr(stop, "reason", str(stop)))
+            arms = f"{', '.join(stopped)}: " if stopped and len(controls) > 1 else ""
+            tally.end_as("stopped", arms + getattr(stop, "reason", str(stop)))
         except _PolicyError as wrong:
             error = wrong.__cause__
             tally.end_as("error", f"{type(error).__name__}: {error}", error)

@@ -249,21 +249,27 @@ def test_a_policy_of_two_arms_sees_and_moves_each_by_its_own_numbers() -> None:
     np.testing.assert_allclose(first["state"][[0, 7]], [before["left"][0], before["right"][0]], atol=1e-6)
 
 
-def test_two_arms_stop_together(rig: Rig) -> None:
-    config = {**ALOHA, "cameras": {}}
-    swing = hal.JointVelocity([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+def test_two_arms_stop_together_and_the_reason_names_the_one_that_stopped() -> None:
+    swing = hal.JointVelocity([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     lost: list[float] = []
-    with hal.open(config, driver="mock") as both:
+    with hal.open({**ALOHA, "cameras": {}}, driver="mock") as both:
+        left, right = both.robots.values()
+        end = both.clock.now() + 1.0
 
         def act(observation: hal.Observation) -> dict[str, hal.JointVelocity]:
-            if both.clock.now() > 1.0:
+            if both.clock.now() > end:
                 lost.append(both.clock.now())
                 both.driver("left").inject(fault="lost")
             return {"left": swing, "right": swing}
 
+        runner = PolicyRunner(both, act, robots=both.robots.values(), rate_hz=50, seconds=0.5)
+        assert runner.run().ended == "time"
+        assert left.state().q_set[0] > 0.1
+        assert left.state().q_set[0] == right.state().q_set[0], "neither waits until the other one is at rest"
         outcome = PolicyRunner(both, act, robots=both.robots.values(), rate_hz=50, seconds=5.0).run()
         assert outcome.ended == "stopped"
-        assert np.abs(both.robots["right"].state().dq_set).max() < 1e-9
+        assert outcome.reason.startswith("left: ")
+        assert np.abs(right.state().dq_set).max() < 1e-9
         assert both.clock.now() - lost[0] < 0.3, "the other arm does not wait for the first to come to rest"
         wrong = PolicyRunner(both, lambda observation: swing, robots=both.robots.values())
         with raises_code(hal.CommandError, "bad_answer"):
