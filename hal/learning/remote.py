@@ -32,7 +32,7 @@ LARGEST = 64 << 20
 ALLOWED_KINDS = "fiub"
 """Kinds of NumPy types that are read from a message: floats, integers and booleans."""
 CONNECT_TIMEOUT = 10.0
-"""Longest wait for a connection and for the server's metadata, s."""
+"""Longest wait for a connection, and then for the server's metadata, s."""
 
 
 def pack(message: Mapping[str, Any]) -> bytes:
@@ -131,15 +131,15 @@ class PolicyClient:
                 (``policy_protocol``).
         """
         if not self.connected:
-            self._wait(self._connect(), CONNECT_TIMEOUT + 1.0)
+            self._wait(self._connect(), 2.0 * CONNECT_TIMEOUT + 1.0)
         return self.metadata
 
     def request(self, message: Mapping[str, Any]) -> Future[Any]:
         """Send a request, and return the future of its reply.
 
         A text is a reply, too: that to a reset, or an error (see :func:`check_actions`). The errors of the future are
-        PolicyErrors: the server does not answer in time (code ``policy_timeout``), is gone (``policy_lost``), or sends
-        something else (``policy_protocol``).
+        PolicyErrors: the server does not take the request and answer in time (code ``policy_timeout``), is gone
+        (``policy_lost``), sends the traceback of an error (``policy_error``) or something else (``policy_protocol``).
         """
         return asyncio.run_coroutine_threadsafe(self._request(pack(message)), self._loop)
 
@@ -190,12 +190,18 @@ class PolicyClient:
             await self._receive(0.0)  # raises an error if the connection is lost
             await self._disconnect()
             raise PolicyError(f"{self.url} sent a message that answers no request", code="policy_protocol")
+        end = self._loop.time() + self.timeout
         try:
-            await self._socket.send_bytes(packed)
+            await asyncio.wait_for(self._socket.send_bytes(packed), self.timeout)
+        except asyncio.TimeoutError:  # the buffers are full: a cable is pulled, or the server is frozen
+            await self._disconnect()
+            raise PolicyError(
+                f"{self.url} did not take a request within {self.timeout:g} s", code="policy_timeout"
+            ) from None
         except (OSError, RuntimeError) as error:
             await self._disconnect()
             raise PolicyError(f"the connection to {self.url} is lost: {error}", code="policy_lost") from error
-        return await self._receive(self.timeout)
+        return await self._receive(end - self._loop.time())
 
     async def _receive(self, timeout: float) -> Any:
         aiohttp = _aiohttp()
@@ -203,7 +209,7 @@ class PolicyClient:
         await asyncio.wait([self._next], timeout=timeout)
         if not self._next.done():
             await self._disconnect()
-            raise PolicyError(f"{self.url} did not answer within {timeout:g} s", code="policy_timeout")
+            raise PolicyError(f"{self.url} did not answer within {timeout:.1f} s", code="policy_timeout")
         message = self._next.result()
         if message.type is aiohttp.WSMsgType.BINARY:
             self._listen()
@@ -216,6 +222,7 @@ class PolicyClient:
             self._listen()
             if "Traceback" in message.data:  # the server closes the connection after it
                 await self._disconnect()
+                raise _server_error(message.data)
             return message.data
         await self._disconnect()
         raise PolicyError(f"the connection to {self.url} is lost", code="policy_lost")
@@ -365,6 +372,12 @@ def _aiohttp() -> Any:
     return aiohttp
 
 
+def _server_error(text: str) -> PolicyError:
+    """Return the error that a server has sent as a text."""
+    last = (text.strip().splitlines() or [""])[-1]
+    return PolicyError(f"the policy's server reports: {last[:500]}", code="policy_error")
+
+
 def check_actions(reply: Any, numbers: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return the actions (steps, numbers) of a reply.
 
@@ -373,8 +386,7 @@ def check_actions(reply: Any, numbers: int) -> np.ndarray[Any, np.dtype[np.float
             not finite (``policy_bad_actions``).
     """
     if isinstance(reply, str):
-        last = (reply.strip().splitlines() or [""])[-1]
-        raise PolicyError(f"the policy's server reports: {last[:500]}", code="policy_error")
+        raise _server_error(reply)
     found = reply.get("actions") if isinstance(reply, dict) else None
     if found is None:
         keys = ", ".join(map(str, reply)) if isinstance(reply, dict) else type(reply).__name__

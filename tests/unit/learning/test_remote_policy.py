@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 from errors_kit import raises_code
 
 import hal
+from hal.geometry import quaternion_to_matrix
 from hal.learning.asynchronous import RemotePolicy
 from hal.learning.policy import PolicyOutcome, PolicyRunner
-from hal.learning.policy_config import PolicyConfig, load_policy_config
+from hal.learning.policy_config import PolicyConfig, _rotation_vector, _rpy, _turn, load_policy_config
 from hal.learning.remote import PolicyClient, PolicyServer, pack, unpack
 
 pytest.importorskip("msgpack")
@@ -339,7 +341,7 @@ def far_away(request: dict[str, Any]) -> dict[str, Any]:
     return {"actions": np.tile([*(request["state"][:7] + 0.5), 0.0], (STEPS, 1))}
 
 
-def fails(request: dict[str, Any]) -> dict[str, Any]:
+def fails(request: dict[str, Any]) -> NoReturn:
     raise ValueError("out of memory")
 
 
@@ -413,6 +415,21 @@ def test_a_server_that_freezes_stops_the_arm_within_its_last_chunk(rig: Rig) -> 
     assert outcome.error.code == "policy_timeout"
     assert rig.clock.now() < calls[-1] + STEPS / 15 + 1.0
     assert np.abs(rig.robots["panda"].state().dq_set).max() < 1e-9
+
+
+def test_a_request_that_the_server_does_not_take_closes_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def block(*_: Any) -> None:
+        await asyncio.sleep(60.0)  # as a full buffer does
+
+    aiohttp = pytest.importorskip("aiohttp")
+    with PolicyServer(stay) as server:
+        client = PolicyClient(server.url, timeout=0.05)
+        client.connect()
+        monkeypatch.setattr(aiohttp.ClientWebSocketResponse, "send_bytes", block)
+        with raises_code(hal.PolicyError, "policy_timeout"):
+            client.request({}).result(5.0)
+        assert not client.connected, "a later answer cannot pass for that to the next request"
+        client.close()
 
 
 class TalkativeServer(PolicyServer):
@@ -515,6 +532,15 @@ def test_a_roboarena_server_is_reset_and_told_its_session(rig: Rig) -> None:
     assert [sorted(request) for request in seen] == [["session_id"]]
 
 
+def test_a_reset_that_fails_on_the_server_is_named_as_the_cause(rig: Rig) -> None:
+    with PolicyServer(stay, reset=fails, metadata=ARENA) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
+        outcome = PolicyRunner(rig, policy, rate_hz=50, seconds=0.5, cameras=()).run()
+        policy.close()
+    assert isinstance(outcome.error, hal.PolicyError)
+    assert (outcome.error.code, outcome.turns) == ("policy_error", 0)
+
+
 @pytest.mark.parametrize(
     ("change", "code"),
     [
@@ -529,6 +555,25 @@ def test_a_roboarena_server_is_reset_and_told_its_session(rig: Rig) -> None:
 def test_what_a_server_needs_and_the_file_lacks_is_named(rig: Rig, change: dict[str, Any], code: str) -> None:
     with raises_code(hal.PolicyError, code):
         run(rig, stay, metadata={**ARENA, **change}, rehearse=True)
+
+
+def test_pictures_have_the_size_that_a_server_asks_for() -> None:
+    requests: list[dict[str, Any]] = []
+    image = {"image": {"camera": "scene", "size": [32, 32]}, "state": {"state": "q"}}
+    config = load_policy_config({**CONFIG, "observation": image})
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        requests.append(request)
+        return stay(request)
+
+    with (
+        PolicyServer(infer, metadata={**ARENA, "image_resolution": [16, 24]}) as server,
+        hal.open("panda_table", driver="mock") as rig,
+    ):
+        policy = RemotePolicy(rig, PolicyClient(server.url), config)
+        policy.rehearse(rig.observe())
+        policy.close()
+    assert requests[0]["image"].shape == (16, 24, 3)
 
 
 @pytest.mark.parametrize("described", ["droid", 3, {"rate_hz": 0}, {**CONFIG, "arms": 1}])
@@ -592,6 +637,18 @@ def test_numbers_are_scaled_and_moved_into_the_policys_frame() -> None:
     assert (picture["observation/image"] != plain["observation/image"]).any()
 
 
+def test_orientations_become_angles_and_rotation_vectors() -> None:
+    half = np.sqrt(0.5)
+    special = [[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [half, half, 0, 0], [0, half, 0, half], [0, -half, 0, half]]
+    quaternions = np.concatenate([special, np.random.default_rng(1).normal(size=(50, 4))])
+    for quaternion in quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True):
+        matrix, vector = quaternion_to_matrix(quaternion), _rotation_vector(quaternion)
+        assert np.linalg.norm(vector) <= np.pi + 1e-9
+        np.testing.assert_allclose(_turn(vector), matrix, atol=1e-9)
+        turned = hal.Pose.from_rpy([0.0, 0.0, 0.0], _rpy(matrix))
+        np.testing.assert_allclose(turned.matrix()[:3, :3], matrix, atol=1e-9)
+
+
 def test_columns_of_a_recording_are_asked_for_and_answered_in_metres() -> None:
     config = load_policy_config("lerobot")
     with hal.open("panda_table", driver="mock") as rig:
@@ -603,6 +660,12 @@ def test_columns_of_a_recording_are_asked_for_and_answered_in_metres() -> None:
     assert request["observation.state"][7] == pytest.approx(observation.grippers["panda"].width)
     np.testing.assert_allclose(decoded.grip, share)
     assert config.due == 1
+
+
+def test_a_scale_for_another_number_of_numbers_is_refused(rig: Rig) -> None:
+    config = load_policy_config({**CONFIG, "observation": {"state": {"state": ["q", "width"], "scale": [1.0] * 7}}})
+    with raises_code(hal.NotSupported, "policy_mismatch"):
+        config.request(rig.observe(cameras=()), rig.robots, "")
 
 
 def test_a_rig_without_the_camera_is_refused_with_both_lists(rig: Rig) -> None:
