@@ -133,22 +133,22 @@ def _main(args: argparse.Namespace) -> int:
         _list(dataset, args)
         return 0
     if args.command == "split":
-        for name, count in split(args.dataset, _parts(dataset, args), args.out).items():
+        for name, count in split(dataset, _parts(dataset, args), args.out).items():
             print(f"{args.out}/{name}: {_many(count)}")
         return 0
     chosen = [episode.number for episode in select_episodes(dataset, args.episodes, successful_only=False)]
     if args.command == "extract":
-        print(f"{args.out}: {_many(extract(args.dataset, chosen, args.out))}")
+        print(f"{args.out}: {_many(extract(dataset, chosen, args.out))}")
     elif args.command == "mark":
-        mark_episodes(args.dataset, dict.fromkeys(chosen, MARKS[args.mark]))
+        mark_episodes(dataset, dict.fromkeys(chosen, MARKS[args.mark]))
         print(f"{_many(len(chosen))} of {dataset.root}: {args.mark}")
     elif args.command == "task":
-        set_task(args.dataset, args.task, chosen)
+        set_task(dataset, args.task, chosen)
         print(f"{_many(len(chosen))} of {dataset.root}: {args.task}")
     elif args.command == "trim":
         _trim(dataset, chosen, args)
     elif args.yes or _confirmed(f"delete {len(chosen)} of {_many(len(dataset))} of {dataset.root}, for good?"):
-        print(f"{dataset.root}: {_many(delete_episodes(args.dataset, chosen))} left")
+        print(f"{dataset.root}: {_many(delete_episodes(dataset, chosen))} left")
     else:
         print("nothing was deleted")
     return 0
@@ -193,7 +193,7 @@ def _trim(dataset: Dataset, chosen: list[int], args: argparse.Namespace) -> None
     if args.dry_run or not kept:
         print(f"{total} would be removed" if kept else "nothing to trim")
     elif args.out or args.yes or _confirmed(f"remove {total} of {dataset.root}, for good?"):
-        trim(args.dataset, kept, args.out, on_episode=_progress())
+        trim(dataset, kept, args.out, on_episode=_progress())
         print(f"{args.out or dataset.root}: {total} removed")
     else:
         print("nothing was removed")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shutil
 from collections.abc import Callable, Collection, Mapping
 from itertools import pairwise
@@ -17,7 +18,7 @@ from .codecs import key_frames
 from .dataset import Dataset, Episode, KeptRows
 from .index import checked_name, dataset_errors
 from .layout import GRID, SETPOINT, STATE, TIMES, EpisodePlace, current_key, video_names
-from .merging import existing_episodes, extract, merge
+from .merging import existing_episodes, extract, merge, open_dataset
 
 __all__ = ["KeptRows", "find_motion", "shares", "split", "trim"]
 
@@ -44,11 +45,11 @@ def shares(count: int, parts: Mapping[str, float], seed: int = 0) -> dict[str, l
     return found
 
 
-def split(dataset: str | Path, parts: Mapping[str, Collection[int]], out: str | Path) -> dict[str, int]:
+def split(dataset: str | Path | Dataset, parts: Mapping[str, Collection[int]], out: str | Path) -> dict[str, int]:
     """Write several datasets of the episodes of one, which is only read. They appear together, when all are complete.
 
     Args:
-        dataset: Folder of the dataset.
+        dataset: The dataset, or its folder.
         parts: Numbers of the episodes of each part, by its name; no episode in two. Episodes in none are left out.
         out: New folder; each part becomes a folder of its name in it.
 
@@ -71,10 +72,11 @@ def split(dataset: str | Path, parts: Mapping[str, Collection[int]], out: str | 
     target = Path(out).expanduser().absolute()
     if target.exists():
         raise CommandError(f"{target} exists; choose a new folder", code="output_exists")
-    building = target.with_name(f".{target.name}.splitting")
+    building = target.with_name(f".{target.name}.splitting-{os.getpid()}")
     shutil.rmtree(building, ignore_errors=True)
+    opened = open_dataset(dataset)
     try:
-        counts = {name: extract(dataset, part, building / name) for name, part in parts.items()}
+        counts = {name: extract(opened, part, building / name) for name, part in parts.items()}
         building.rename(target)
     finally:
         shutil.rmtree(building, ignore_errors=True)
@@ -82,7 +84,7 @@ def split(dataset: str | Path, parts: Mapping[str, Collection[int]], out: str | 
 
 
 def trim(
-    dataset: str | Path,
+    dataset: str | Path | Dataset,
     kept: Mapping[int, KeptRows],
     out: str | Path | None = None,
     *,
@@ -94,7 +96,7 @@ def trim(
     row that is kept, and ``trimmed`` in the episode's file tells which rows of the recording are left.
 
     Args:
-        dataset: Folder of the dataset.
+        dataset: The dataset, or its folder.
         kept: The rows to keep of each episode, by its number, as from :func:`find_motion`; others keep all.
         out: Folder of the result; None replaces the dataset when the result is complete.
         on_episode: Called with the number of episodes that are written and of all, after each.
@@ -107,8 +109,9 @@ def trim(
             key frame (``bad_rows``); otherwise as :func:`~hal.recording.merge`.
         DatasetError: The dataset is damaged.
     """
-    existing_episodes(dataset, kept)
-    episodes = Dataset(dataset).episodes
+    opened = open_dataset(dataset)
+    existing_episodes(opened, kept)
+    episodes = opened.episodes
     removed = 0
     for number, rows in kept.items():
         length = episodes[number].length
@@ -126,7 +129,7 @@ def trim(
         rows = kept.get(episode.number, KeptRows(0, episode.length))
         return episode if rows == (0, episode.length) else _TrimmedEpisode(episode, rows)
 
-    merge([dataset], dataset if out is None else out, view=view, on_episode=on_episode)
+    merge([opened], opened.root if out is None else out, view=view, on_episode=on_episode)
     return removed
 
 

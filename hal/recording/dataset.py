@@ -23,6 +23,7 @@ from .layout import (
     DatasetLayout,
     EpisodePlace,
     current_key,
+    file_version,
     finish_replacement,
     require_libraries,
     video_key,
@@ -54,6 +55,10 @@ class KeptRows(NamedTuple):
     """Row after the last one."""
 
 
+_MAY_CHANGE = {"files": None, "task": None, "success": None}
+"""Metadata that an episode can get later."""
+
+
 class Episode:
     """One finished episode. Files are read only when an attribute or method needs them.
 
@@ -72,11 +77,47 @@ class Episode:
         """The rows that are left of an episode that is being trimmed; None for one as it is on the disk."""
         self.number = number
         self.fps: int = meta["fps"]
+        self._version: tuple[int, int] | None = None
+        """Of the episode's metadata file when it was read."""
 
     @cached_property
     def info(self) -> dict[str, Any]:
         """Content of ``episodes/N.json``: seed, cameras, gaps, versions, the rig's whole configuration."""
-        return read_about(self._layout, self.number) if self._about is None else self._about
+        if self._about is not None:
+            return self._about
+        self._version = file_version(self._layout.about(self.number))
+        return read_about(self._layout, self.number)
+
+    def _is_current(self) -> bool:
+        """Return whether the known place is that of the episode's files now."""
+        return self._about is not None or self._version == file_version(self._layout.about(self.number))
+
+    def _follow(self) -> None:
+        """Read the metadata again if the episode was marked, or its files joined with others, since it was read.
+
+        Raises DatasetError (code ``dataset_changed``) if another episode has this number now.
+        """
+        known = self.info
+        if self._is_current():
+            return
+        version, found = file_version(self._layout.about(self.number)), read_about(self._layout, self.number)
+        if known | _MAY_CHANGE != found | _MAY_CHANGE:
+            raise self._changed()
+        self._version, self.info = version, found
+        self.__dict__.pop("place", None)
+
+    def _changed(self) -> DatasetError:
+        return DatasetError(
+            "another episode has this number since the dataset was opened: open it again",
+            file=self._name(self._layout.about(self.number)),
+            episode=self.number,
+            code="dataset_changed",
+        )
+
+    def _check_current(self) -> None:
+        """Raise DatasetError if a file that was just read may be of another episode."""
+        if not self._is_current():
+            raise self._changed()
 
     @property
     def length(self) -> int:
@@ -131,6 +172,7 @@ class Episode:
         """Return the rows as an Arrow table, with the columns as they are stored."""
         import pyarrow.parquet as pq
 
+        self._follow()
         file_number, first = self.place.data
         path = self._layout.data(file_number)
         with (
@@ -149,6 +191,7 @@ class Episode:
                 raise self._wrong(path, f"has {end} rows, and the episode ends with row {first + self.length}")
             if set(table["episode_index"].to_pylist()) != {self.number}:
                 raise self._wrong(path, "has rows of another episode")
+        self._check_current()
         return table
 
     def names(self, key: str) -> list[str]:
@@ -224,12 +267,14 @@ class Episode:
         own = range(self.length)[row]
         with dataset_errors(self._layout.root, path, self.number):
             found = next(read_video(path, self.first_picture(path) + own, self.fps), None)
+        self._check_current()
         if found is None:
             raise self._wrong(path, f"has no picture of row {own}")
         return found
 
     def _file_of(self, camera: str, stream: str) -> Path:
         """Return the file of a stream. Raises DeviceNotFound if it was not recorded."""
+        self._follow()
         files = self.files(camera)
         if stream not in files:
             there = ", ".join(self.cameras) or "none"
@@ -269,6 +314,7 @@ class Episode:
 
         Pictures are counted, not decoded, which takes milliseconds.
         """
+        self._follow()
         for path in (path for camera in self.cameras for path in self.files(camera).values()):
             with dataset_errors(self._layout.root, path, self.number):
                 if path.suffix == ".mp4":
@@ -281,6 +327,8 @@ class Episode:
         count = 0
         with dataset_errors(self._layout.root, path, self.number):
             for picture in islice(pictures, self.length + (path.suffix != ".mp4")):
+                if count == 0:  # the file is open
+                    self._check_current()
                 if picture.shape != shape:
                     raise self._wrong(path, f"has a picture of {picture.shape}, not {shape}")
                 count += 1
@@ -332,7 +380,9 @@ class CameraDepth(Sequence[NDArray[np.float32]]):
             return [self[k] for k in range(*row.indices(len(self)))]
         own = range(len(self))[row]  # IndexError as it is: iteration ends with it
         with dataset_errors(self._episode._layout.root, self._path, self._episode.number):
-            return self._reader[own]
+            found = self._reader[own]
+        self._episode._follow()
+        return found
 
 
 class EpisodeDepth:
@@ -389,7 +439,8 @@ class Dataset:
     def __init__(self, out: str | Path) -> None:
         require_libraries()
         finish_replacement(out)
-        layout = DatasetLayout(out)
+        self._layout = layout = DatasetLayout(out)
+        self._version = file_version(layout.info)
         foreign = read_foreign(layout) if is_foreign(layout) else None
         info = read_index(layout) if foreign is None else foreign.info
         if info is None or info["total_episodes"] == 0:
@@ -402,6 +453,10 @@ class Dataset:
         self.fps: int = info["fps"]
         abouts = [None] * info["total_episodes"] if foreign is None else foreign.episodes
         self.episodes = tuple(Episode(layout, number, info, about) for number, about in enumerate(abouts))
+
+    def has_changed(self) -> bool:
+        """Return whether episodes were added, removed or changed since the dataset was opened."""
+        return self._version != file_version(self._layout.info)
 
     def __len__(self) -> int:
         return len(self.episodes)

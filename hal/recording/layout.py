@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import fcntl
 import importlib.util
 import json
@@ -42,8 +43,10 @@ __all__ = [
     "VIDEO_MB",
     "current_key",
     "features_of",
+    "file_version",
     "finish_replacement",
     "lock_dataset",
+    "put_in_place",
     "read_json",
     "require_libraries",
     "sync_to_disk",
@@ -360,6 +363,51 @@ def finish_replacement(out: str | Path) -> None:
         replaced.rename(target.root)
 
 
+def put_in_place(building: Path, target: Path, *, replaces: bool) -> None:
+    """Move a complete dataset to its place. With ``replaces`` the one that is there is removed.
+
+    Both are exchanged in one step, so that there is a dataset in this place at any moment. On file systems that cannot,
+    :func:`finish_replacement` puts the old one back if the program is killed between two steps.
+
+    Raises:
+        OSError: The place is taken, or cannot be renamed; what is there stays as it was.
+    """
+    if not replaces:
+        building.rename(target)  # over an empty folder at most
+        sync_to_disk(target.parent)
+        return
+    if not _exchange(building, target):
+        replaced = DatasetLayout(target).beside("replaced")
+        target.rename(replaced)
+        try:
+            building.rename(target)
+        except OSError:
+            with contextlib.suppress(OSError):
+                replaced.rename(target)
+            raise
+        replaced.rename(building)
+    sync_to_disk(target.parent)
+    shutil.rmtree(building, ignore_errors=True)
+
+
+_HERE, _EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Exchange two folders in one step. Return False, and do nothing, where that is not possible."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    return rename is not None and rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0
+
+
+def file_version(path: Path) -> tuple[int, int] | None:
+    """Return two numbers that change when a file is written anew; None if there is no file."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_mtime_ns
+
+
 @contextlib.contextmanager
 def lock_dataset(layout: DatasetLayout) -> Iterator[None]:
     """Hold the dataset's lock, so that no other process adds to it. The lock ends with the process.
@@ -368,23 +416,35 @@ def lock_dataset(layout: DatasetLayout) -> Iterator[None]:
         CommandError: Another process holds it (code ``dataset_locked``), or ``episodes/`` is a link
             (``dataset_link``).
     """
+    deadline = time.monotonic() + _PATIENCE
+    while (fd := _lock_now(layout)) is None:
+        if time.monotonic() > deadline:
+            raise CommandError(f"another program is recording into {layout.root}", code="dataset_locked")
+        time.sleep(0.05)
+    try:
+        yield
+    finally:
+        os.close(fd)
+
+
+def _lock_now(layout: DatasetLayout) -> int | None:
+    """Return the open lock file of a dataset.
+
+    None if another process holds it, or has put another dataset in this place since the file was opened.
+    """
+    finish_replacement(layout.root)
     layout.episodes.mkdir(parents=True, exist_ok=True)
     if layout.episodes.is_symlink():
         raise CommandError(f"{layout.episodes} is a link; nothing is recorded through it", code="dataset_link")
-    fd = os.open(layout.episodes / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-    with os.fdopen(fd, "w") as file:
-        deadline = time.monotonic() + _PATIENCE
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    raise CommandError(
-                        f"another program is recording into {layout.root}", code="dataset_locked"
-                    ) from None
-                time.sleep(0.05)
-        yield
+    path, fd = layout.episodes / ".lock", None
+    with contextlib.suppress(BlockingIOError, FileNotFoundError):
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.path.samestat(os.fstat(fd), path.stat()):
+            return fd
+    if fd is not None:
+        os.close(fd)
+    return None
 
 
 def sync_to_disk(path: Path) -> None:

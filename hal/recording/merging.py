@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CommandError, DatasetError, HalError
+from ..errors import CommandError, DatasetError
 from .checking import format_differences
 from .codecs import (
     Stats,
@@ -36,7 +36,7 @@ from .codecs import (
 from .dataset import Dataset, Episode
 from .finish import entries_table, entry_row, last_row, new_info, stats_of, tasks_table, write_table
 from .foreign import is_foreign
-from .index import dataset_errors, read_entries, read_tasks
+from .index import check_next_episode, dataset_errors, read_entries, read_tasks
 from .layout import (
     CHUNK,
     GROUP,
@@ -45,6 +45,7 @@ from .layout import (
     EpisodePlace,
     finish_replacement,
     lock_dataset,
+    put_in_place,
     require_libraries,
     video_names,
     write_json,
@@ -81,7 +82,7 @@ class _Source(NamedTuple):
 
 
 def merge(
-    parts: Sequence[str | Path],
+    parts: Sequence[str | Path | Dataset],
     out: str | Path,
     *,
     key: Callable[[Episode], Any] | None = None,
@@ -92,8 +93,9 @@ def merge(
     """Merge datasets into one. The parts are only read; the result appears when it is complete.
 
     Args:
-        parts: Folders of the datasets.
-        out: Folder of the result: a new one, or one of the parts, which is replaced.
+        parts: The datasets, or their folders. A :class:`Dataset` must not have changed since it was opened.
+        out: Folder of the result: a new one, or one of the parts, which is replaced. Files in it that are no part of a
+            dataset, such as notes, stay.
         key: Sorts the episodes; of several with the same key the first is kept. None for the order of the parts.
         label: Returns the task and the mark of an episode in the result; None leaves it out. By default its own.
         view: Returns an episode as it is written (:func:`~hal.recording.trim`).
@@ -104,16 +106,23 @@ def merge(
 
     Raises:
         CommandError: A part has unfinished episodes (code ``unfinished_episodes``), no episode (``no_episodes``) or
-            another format than the first (``other_dataset``), or ``out`` exists (``output_exists``).
+            another format than the first (``other_dataset``), or has changed (``dataset_changed``); or ``out`` exists
+            (``output_exists``), or is a mount point (``mount_point``).
         DatasetError: A part is damaged.
         OSError: The disk refuses.
     """
     require_libraries()
     finish_replacement(out)
     target = DatasetLayout(Path(out).expanduser().resolve())  # not through a link: folders beside it are renamed
-    building, replaced = target.beside("merging"), target.beside("replaced")
-    layouts = [DatasetLayout(Path(part).expanduser().resolve()) for part in parts]
+    building = DatasetLayout(target.beside("merging"))
+    folders = [part.root if isinstance(part, Dataset) else part for part in parts]
+    layouts = [DatasetLayout(Path(folder).expanduser().resolve()) for folder in folders]
     replaces = target.root in [layout.root for layout in layouts]
+    if target.root.is_mount():
+        raise CommandError(
+            f"{target.root} is a mount point, which cannot be replaced; keep datasets in folders of it",
+            code="mount_point",
+        )
     if not replaces and target.root.exists() and (not target.root.is_dir() or any(target.root.iterdir())):
         raise CommandError(f"{target.root} exists; choose a new folder", code="output_exists")
     with contextlib.ExitStack() as locks:
@@ -132,25 +141,61 @@ def merge(
                     f"{layout.root} has an unfinished episode; finish it first, with recover()",
                     code="unfinished_episodes",
                 )
+        for part in parts:
+            if isinstance(part, Dataset) and part.has_changed():
+                raise CommandError(
+                    f"{part.root} has changed since it was opened; nothing was done", code="dataset_changed"
+                )
         sources = _sources(layouts, key, label or _label, view)
-        shutil.rmtree(building, ignore_errors=True)
-        _Builder(DatasetLayout(building), sources).build(on_episode)
-        os.sync()  # the parts may be removed next
-        if replaces:
-            shutil.rmtree(replaced, ignore_errors=True)
-            target.root.rename(replaced)
-        elif target.root.exists():
-            target.root.rmdir()
-        building.rename(target.root)
-        shutil.rmtree(replaced, ignore_errors=True)
+        locks.enter_context(lock_dataset(building))  # another process may be merging into the same folder
+        try:
+            _clear(building)
+            _Builder(building, sources).build(on_episode)
+            if replaces:
+                _keep_other_files(target, building)
+            os.sync()  # the parts may be removed next
+            put_in_place(building.root, target.root, replaces=replaces)
+        finally:
+            shutil.rmtree(building.root, ignore_errors=True)
     return len(sources)
 
 
-def extract(dataset: str | Path, episodes: Collection[int], out: str | Path) -> int:
+def _clear(building: DatasetLayout) -> None:
+    """Remove what a merge that was killed has left, but not the lock."""
+    for path in (*building.root.iterdir(), *building.episodes.iterdir()):
+        if path.is_dir() and not path.is_symlink():
+            if path != building.episodes:
+                shutil.rmtree(path)
+        elif path.name != ".lock":
+            path.unlink()
+
+
+def _keep_other_files(old: DatasetLayout, new: DatasetLayout) -> None:
+    """Link the files that are no part of a dataset, such as notes, into the dataset that takes its place."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    old.sweep()
+    own = {*old.finished(), old.info, old.stats, old.tasks, old.episodes / ".lock"}
+    for folder, folders, files in os.walk(old.root, onerror=refuse):
+        links = [name for name in folders if Path(folder, name).is_symlink()]
+        for path in (Path(folder, name) for name in (*files, *links)):
+            target = new.root / path.relative_to(old.root)
+            if path in own or target.exists():
+                continue
+            if path.is_symlink():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.symlink_to(path.readlink())
+            else:
+                _link(path, target)
+
+
+def extract(dataset: str | Path | Dataset, episodes: Collection[int], out: str | Path) -> int:
     """Write a new dataset of some episodes of another one, which is only read.
 
     Args:
-        dataset: Folder of the dataset.
+        dataset: The dataset, or its folder.
         episodes: Numbers of the episodes.
         out: Folder of the result: a new one, or that of the dataset, which then keeps only these episodes.
 
@@ -161,11 +206,12 @@ def extract(dataset: str | Path, episodes: Collection[int], out: str | Path) -> 
         CommandError: There is no such episode (code ``no_episodes``); otherwise as :func:`merge`.
         DatasetError: The dataset is damaged.
     """
-    chosen = existing_episodes(dataset, episodes)
-    return merge([dataset], out, label=lambda episode: _label(episode) if episode.number in chosen else None)
+    opened = open_dataset(dataset)
+    chosen = existing_episodes(opened, episodes)
+    return merge([opened], out, label=lambda episode: _label(episode) if episode.number in chosen else None)
 
 
-def delete_episodes(dataset: str | Path, episodes: Collection[int]) -> int:
+def delete_episodes(dataset: str | Path | Dataset, episodes: Collection[int]) -> int:
     """Delete episodes; those after them get lower numbers. Return the number of episodes that are left.
 
     Raises:
@@ -173,26 +219,29 @@ def delete_episodes(dataset: str | Path, episodes: Collection[int]) -> int:
             :func:`merge`.
         DatasetError: The dataset is damaged.
     """
-    doomed = existing_episodes(dataset, episodes)
-    return merge([dataset], dataset, label=lambda episode: None if episode.number in doomed else _label(episode))
+    opened = open_dataset(dataset)
+    doomed = existing_episodes(opened, episodes)
+    return merge([opened], opened.root, label=lambda episode: None if episode.number in doomed else _label(episode))
 
 
-def set_task(dataset: str | Path, task: str, episodes: Collection[int] | None = None) -> None:
+def set_task(dataset: str | Path | Dataset, task: str, episodes: Collection[int] | None = None) -> None:
     """Change the task of episodes; None for all. Raises as :func:`extract`."""
-    chosen = range(len(Dataset(dataset))) if episodes is None else existing_episodes(dataset, episodes)
+    opened = open_dataset(dataset)
+    chosen = range(len(opened)) if episodes is None else existing_episodes(opened, episodes)
     merge(
-        [dataset],
-        dataset,
+        [opened],
+        opened.root,
         label=lambda episode: EpisodeLabel(task, episode.success) if episode.number in chosen else _label(episode),
     )
 
 
-def mark_episodes(dataset: str | Path, marks: Mapping[int, bool | None]) -> None:
+def mark_episodes(dataset: str | Path | Dataset, marks: Mapping[int, bool | None]) -> None:
     """Mark episodes as a success (True), a failure (False) or neither (None). Raises as :func:`extract`."""
-    existing_episodes(dataset, marks)
+    opened = open_dataset(dataset)
+    existing_episodes(opened, marks)
     merge(
-        [dataset],
-        dataset,
+        [opened],
+        opened.root,
         label=lambda episode: EpisodeLabel(episode.task, marks.get(episode.number, episode.success)),
     )
 
@@ -217,25 +266,41 @@ LOOSE = 100
 
 
 def pack_if_loose(dataset: str | Path) -> None:
-    """Call :func:`pack` if many episodes have files of their own. Never raises; what cannot be joined stays."""
+    """Call :func:`pack` if many episodes have files of their own, and no large file would be copied.
+
+    Never raises; what cannot be joined stays.
+    """
     try:
         episodes = Dataset(dataset).episodes if DatasetLayout(dataset).info.exists() else ()
         if episodes and episodes[-1].place.data[0] + 1 - -(-len(episodes) // GROUP) >= LOOSE:
+            _check_links(DatasetLayout(Path(dataset).expanduser().resolve()))
             pack(dataset)
-    except (HalError, OSError) as error:
+    except Exception as error:  # the recorder is closed, and every episode saved
         _LOG.warning("the files of %s were not joined: %s", dataset, error)
+
+
+def _check_links(layout: DatasetLayout) -> None:
+    """Raise OSError if files cannot be linked into a folder beside the dataset, as from a mount point."""
+    probe = layout.beside(f"link-{os.getpid()}")
+    os.link(layout.info, probe)
+    probe.unlink()
 
 
 def _label(episode: Episode) -> EpisodeLabel:
     return EpisodeLabel(episode.task, episode.success)
 
 
-def existing_episodes(dataset: str | Path, episodes: Collection[int]) -> frozenset[int]:
+def open_dataset(dataset: str | Path | Dataset) -> Dataset:
+    """Return a dataset, opened if it is a folder."""
+    return dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+
+
+def existing_episodes(dataset: Dataset, episodes: Collection[int]) -> frozenset[int]:
     """Return the numbers of episodes, all of which exist."""
-    count = len(Dataset(dataset))
+    count = len(dataset)
     if unknown := sorted(set(episodes) - set(range(count))):
         raise CommandError(
-            f"there is no episode {unknown[0]} in {dataset}; there are {count}, from 0 on", code="no_episodes"
+            f"there is no episode {unknown[0]} in {dataset.root}; there are {count}, from 0 on", code="no_episodes"
         )
     if not episodes:
         raise CommandError("no episode was selected", code="no_episodes")
@@ -250,6 +315,8 @@ def _sources(
 ) -> list[_Source]:
     """Return the episodes of all parts, in the order of the result. Raises CommandError if their formats differ."""
     datasets = [Dataset(layout.root) for layout in layouts]
+    for layout, dataset in zip(layouts, datasets, strict=True):
+        check_next_episode(layout, dataset.info)  # episodes that the index lacks would be lost
     for dataset in datasets[1:]:
         found = format_differences(datasets[0].info, dataset.info) + _camera_differences(datasets[0], dataset)
         if found:
@@ -303,7 +370,6 @@ class _Builder:
         """Write everything, ``info.json`` last."""
         count = len(self.sources)
         parts: dict[str, list[Stats]] = {}
-        self.layout.episodes.mkdir(parents=True)
         with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:  # the libraries release the lock
             try:
                 names = video_names(self.features)
@@ -512,11 +578,15 @@ def _fits(file: Sequence[_Run], run: _Run) -> bool:
 
 
 def _link(source: Path, target: Path) -> None:
-    """Make a hard link, or a copy on a file system that has none or is another one."""
+    """Make a hard link, or a copy on a file system that has none or is another one.
+
+    Raises FileExistsError and changes nothing if ``target`` exists: it may be a link to a file of another dataset.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)
-    except FileNotFoundError:
+    except (FileNotFoundError, FileExistsError):
         raise
     except OSError:
-        shutil.copyfile(source, target)
+        with source.open("rb") as read, target.open("xb") as write:
+            shutil.copyfileobj(read, write, 1 << 20)

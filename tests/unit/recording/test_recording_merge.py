@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
+import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +27,14 @@ from hal.recording import (
     pack,
     repair,
 )
+from hal.recording import (
+    dataset as dataset_module,
+)
+from hal.recording import (
+    layout as layout_module,
+)
 from hal.recording.checking import check_dataset
+from hal.recording.layout import DatasetLayout, lock_dataset
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -112,12 +123,15 @@ def test_what_cannot_be_merged_is_refused(part: Path, tmp_path: Path) -> None:
     (copy / "meta/info.json").write_text(json.dumps(info | {"fps": 10}))
     with raises_code(CommandError, "other_dataset"):
         merge([part, copy], out)
+    (copy / "meta/info.json").write_text(json.dumps(info | {"total_episodes": 1}))
+    with raises_code(DatasetError, "index_wrong"):
+        pack(copy)
     (copy / "meta/info.json").write_text(json.dumps(info))
     (copy / "videos/observation.images.wrist/chunk-000/file-001.mp4").unlink()
     with pytest.raises(DatasetError) as damaged:
         merge([part, copy], out)
     assert damaged.value.episode == 1
-    assert not out.exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"], "nothing is left of the attempts"
 
 
 def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
@@ -154,11 +168,19 @@ def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
     assert len(list(demo.glob("videos/*/*/*.mp4"))) == len(CAMERAS)
 
 
-@pytest.mark.parametrize("killed_at", [1, 2])
+@pytest.mark.parametrize("killed_at", ["before the exchange", "after the exchange", 1, 2, 3])
 def test_a_dataset_survives_a_kill_while_it_is_replaced(
-    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: str | int
 ) -> None:
     demo, renames, rename = Path(shutil.copytree(part, tmp_path / "demo")), [0], Path.rename
+    exchange = layout_module._exchange
+
+    def killed_or_not_possible(one: Path, other: Path) -> bool:
+        if killed_at == "after the exchange":
+            assert exchange(one, other)
+        if isinstance(killed_at, str):
+            raise KeyboardInterrupt
+        return False
 
     def killed(self: Path, target: Path) -> Path:
         renames[0] += 1
@@ -168,11 +190,133 @@ def test_a_dataset_survives_a_kill_while_it_is_replaced(
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(Path, "rename", killed)
+        patched.setattr(layout_module, "_exchange", killed_or_not_possible)
+        patched.setattr(shutil, "rmtree", lambda *_, **__: None)
         pack(demo)
-    assert demo.exists() is (killed_at == 1)
-    with mock_rig() as rig, Recorder(rig, demo, fps=20, task="lift") as recorder:
-        record(recorder, 0.2)
-    assert check_layout(demo)["total_episodes"] == 3, "the recorder continues it"
+    assert demo.exists() is (killed_at != 2)
+    total = 2
+    if killed_at == 2:
+        with mock_rig() as rig, Recorder(rig, demo, fps=20, task="lift") as recorder:
+            record(recorder, 0.2)
+        total = 3
+    assert check_layout(demo)["total_episodes"] == total, "the recorder continues it"
+    if killed_at == 3:
+        with monkeypatch.context() as patched, pytest.raises(OSError, match="replaced"):
+            patched.setattr(layout_module, "_exchange", lambda *_: False)
+            pack(demo)  # what was replaced could be the only copy
+        (tmp_path / ".demo.replaced").rename(tmp_path / "old")
+    assert pack(demo) == total
+    assert {path.name for path in tmp_path.iterdir()} <= {"demo", "old"}
+
+
+def test_a_reader_follows_joined_files_and_refuses_another_episode(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demo = Path(shutil.copytree(part, tmp_path / "demo"))
+    before, opened = Dataset(part), Dataset(demo)
+    depth = opened.episodes[1].depth["wrist"]
+    assert [episode.place.data for episode in opened.episodes] == [(0, 0), (1, 0)]
+    pack(demo)
+    mark_episodes(demo, {1: False})
+    for one, other in zip(before.episodes, opened.episodes, strict=True):
+        assert pictures_of(one, "color") == pictures_of(other, "color")
+        assert np.array_equal(one.columns["action"], other.columns["action"])
+    assert opened.episodes[1].frame("wrist", 2).tobytes() == before.episodes[1].frame("wrist", 2).tobytes()
+    assert np.array_equal(depth[2], before.episodes[1].depth["wrist"][2])
+    assert opened.episodes[1].place.data == (0, before.episodes[0].length)
+    assert opened.episodes[1].success is False
+
+    fresh, read_video = Dataset(demo).episodes[0], dataset_module.read_video
+
+    def read_after_a_deletion(*args: Any) -> Any:
+        delete_episodes(demo, [0])
+        return read_video(*args)
+
+    fresh.files("wrist")
+    with monkeypatch.context() as patched, raises_code(DatasetError, "dataset_changed"):
+        patched.setattr(dataset_module, "read_video", read_after_a_deletion)
+        fresh.frame("wrist", 0)
+    first = opened.episodes[0]
+    for read in (lambda: next(first.frames("wrist")), lambda: first.frame("wrist", 0), first.read_table):
+        with raises_code(DatasetError, "dataset_changed"):
+            read()
+
+
+def test_numbers_of_episodes_are_those_of_the_dataset_that_was_opened(part: Path, tmp_path: Path) -> None:
+    demo = tmp_path / "demo"
+    merge([part, part], demo)
+    opened = Dataset(demo)
+    delete_episodes(demo, [0])
+    with raises_code(CommandError, "dataset_changed"):
+        delete_episodes(opened, [0])
+    assert len(Dataset(demo)) == 3
+
+
+def test_a_lock_of_a_dataset_that_was_replaced_is_not_kept(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demo, lock, calls = Path(shutil.copytree(part, tmp_path / "demo")), fcntl.flock, [0]
+
+    def replaced_meanwhile(*args: Any) -> None:
+        calls[0] += 1
+        if calls[0] == 1:
+            pack(demo)
+        lock(*args)
+
+    monkeypatch.setattr(layout_module.fcntl, "flock", replaced_meanwhile)
+    with lock_dataset(DatasetLayout(demo)):
+        monkeypatch.setattr(layout_module, "_PATIENCE", 0.0)
+        with raises_code(CommandError, "dataset_locked"), lock_dataset(DatasetLayout(demo)):
+            pass
+
+
+def test_two_merges_into_one_folder_exclude_each_other(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    building = DatasetLayout(tmp_path / ".out.merging")
+    monkeypatch.setattr(layout_module, "_PATIENCE", 0.0)
+    with lock_dataset(building):
+        (building.root / "data").mkdir()
+        with raises_code(CommandError, "dataset_locked"):
+            merge([part], tmp_path / "out")
+        assert (building.root / "data").exists()
+        with pytest.raises(FileExistsError):
+            merging._link(part / "meta/info.json", building.episodes / ".lock")
+    (building.root / "link").symlink_to("data")
+    assert merge([part], tmp_path / "out") == 2, "what a killed program left is removed"
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["data", "depth", "episodes", "meta", "videos"]
+
+
+def test_other_files_in_the_folder_stay(part: Path, tmp_path: Path) -> None:
+    demo = Path(shutil.copytree(part, tmp_path / "demo"))
+    (demo / "notes/monday").mkdir(parents=True)
+    for name in ("README.md", "notes/monday/grasp.txt", "episodes/remark.txt"):
+        (demo / name).write_text(name)
+    (demo / "newest").symlink_to("notes/monday")
+    delete_episodes(demo, [0])
+    for name in ("README.md", "notes/monday/grasp.txt", "episodes/remark.txt"):
+        assert (demo / name).read_text() == name
+    assert (demo / "newest").readlink() == Path("notes/monday")
+    assert check_layout(demo)["total_episodes"] == 1
+
+
+def test_a_mount_point_is_not_replaced(part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    demo = Path(shutil.copytree(part, tmp_path / "demo"))
+
+    def not_linked(source: Path, target: Path) -> None:
+        raise OSError(errno.EXDEV, "another file system")
+
+    monkeypatch.setattr(merging, "LOOSE", 1)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "link", not_linked)
+        merging.pack_if_loose(demo)
+        assert len(list(demo.glob("data/*/*"))) == 2, "not by itself: all files would be copied"
+        patched.setattr(Path, "is_mount", lambda path: path == demo)
+        with raises_code(CommandError, "mount_point"):
+            pack(demo)
+    assert [path.name for path in tmp_path.iterdir()] == ["demo"]
+    merging.pack_if_loose(demo)
+    assert len(list(demo.glob("data/*/*"))) == 1
 
 
 def test_large_videos_are_linked_and_small_ones_joined_up_to_a_size(
