@@ -38,7 +38,7 @@ def drive(engine: str, steps: int) -> tuple[bytes, bytes]:
 
 
 def test_two_runs_are_equal_to_the_bit(engine: Engine) -> None:
-    assert drive(engine.name, 600) == drive(engine.name, 600)
+    assert drive(engine.name, 300) == drive(engine.name, 300)
 
 
 def test_time_stands_still_between_waits(rig: hal.Rig) -> None:

@@ -39,7 +39,13 @@ def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def imports(module: str) -> Iterator[str]:
+@cache
+def imports(module: str) -> tuple[str, ...]:
+    """Return the dotted names that a module imports, see :func:`_imports`; several tests need those of every module."""
+    return tuple(_imports(module))
+
+
+def _imports(module: str) -> Iterator[str]:
     """Yield the dotted names that a module imports, ``module.name`` for each name, TYPE_CHECKING included."""
     path = sources()[module]
     package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]

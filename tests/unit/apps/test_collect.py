@@ -76,7 +76,7 @@ def put(world: hal.Rig, seed: int) -> np.ndarray:
 # The pad.
 
 
-@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("again", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_demonstration_that_misses_the_cube_is_a_failure(
     call: Collect, tmp_path: Path, capsys: pytest.CaptureFixture[str], again: bool
 ) -> None:
@@ -92,6 +92,7 @@ def test_a_demonstration_that_misses_the_cube_is_a_failure(
     assert "the cube was not lifted" in out
 
 
+@pytest.mark.slow
 def test_the_recorded_pad_is_the_output_of_its_program() -> None:
     """Presses only, and to 0.1 s: other builds of the physics differ in the last bits."""
     need_engine("pybullet")

@@ -127,6 +127,7 @@ def test_planned_views_show_the_whole_board_from_all_sides() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_drawn_images_lead_to_the_camera() -> None:
     """Everything but an arm: images drawn through a lens, detected, solved."""
     detector, taken = Detector(BOARD), []

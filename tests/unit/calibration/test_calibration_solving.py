@@ -109,7 +109,7 @@ def test_a_board_of_another_size_gives_a_warning(share: float) -> None:
 
 
 @pytest.mark.parametrize("eye", EYES)
-@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize("share", [0.9, pytest.param(1.1, marks=pytest.mark.slow)])
 def test_a_K_or_a_board_wrong_by_a_tenth_is_refused(eye: Eye, share: float) -> None:
     wrong = K * [[share], [share], [1.0]]
     assert refused(views(eye, poses(15, 3), noise_px=0.2, arm=2e-4, believed=wrong), eye) == "wrong_size"

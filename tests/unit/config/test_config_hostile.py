@@ -17,7 +17,7 @@ from hal.config.data_files import find_data
 from hal.config.mapping import load_mapping
 from hal.errors import ConfigError, Problem
 
-MUTATIONS = int(os.environ.get("HAL_FUZZ_COUNT", "200"))
+MUTATIONS = int(os.environ.get("HAL_FUZZ_COUNT", "120"))
 """Number of mutated rigs; a longer run is asked for by the environment."""
 NINE = "[" + ", ".join(["*a"] * 9) + "]"
 BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(

@@ -106,7 +106,7 @@ def run(steps: int) -> bytes:
 
 
 def test_the_same_seed_and_actions_give_the_same_states_to_the_bit() -> None:
-    assert run(100) == run(100)
+    assert run(50) == run(50)
 
 
 def test_an_action_moves_the_arm_by_its_values() -> None:
@@ -164,6 +164,7 @@ def test_joints_move_by_velocities_with_a_controller_or_by_bare_torques(
 RANGES = "objects.3={file: duck, random: {x: [0.2, 0.3], y: [-0.3, 0.3], yaw_deg: [-180, 180]}}"
 
 
+@pytest.mark.slow
 def test_the_same_seed_starts_at_the_same_poses_to_the_bit_and_without_one_come_the_next() -> None:
     def used(env: RigEnv, options: dict[str, object]) -> None:
         env.np_random.uniform(size=1 if env.observation is None else 5)
@@ -308,7 +309,7 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
     try:
         env.reset()
         pictures, stamps = [], []
-        for _ in range(15):
+        for _ in range(8):
             sent = env.rig.clock.now()
             seen, *_ = env.step(np.array([0.05, 0, 0, 0, 0, 0, 0], np.float32))
             assert env.observation is not None
@@ -338,6 +339,7 @@ def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
         env.close()
 
 
+@pytest.mark.slow
 def test_several_in_processes_of_their_own() -> None:
     make = functools.partial(RigEnv, "panda_table", sim=True, action="twist", overrides=BARE)  # importable there
     envs = gymnasium.vector.AsyncVectorEnv([make, make], context="spawn")

@@ -83,8 +83,15 @@ def episode() -> Recorded:
 # How it goes.
 
 
-@pytest.mark.parametrize("driver", ["mock", "simulation"])
-@pytest.mark.parametrize("speed", [1.0, 0.5])
+@pytest.mark.parametrize(
+    ("driver", "speed"),
+    [
+        ("mock", 0.5),
+        ("simulation", 1.0),
+        pytest.param("mock", 1.0, marks=pytest.mark.slow),
+        pytest.param("simulation", 0.5, marks=pytest.mark.slow),
+    ],
+)
 def test_a_replay_is_where_the_recording_was(driver: str, speed: float) -> None:
     episode = record(driver)
     with opened(driver) as rig:

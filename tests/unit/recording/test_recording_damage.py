@@ -140,7 +140,10 @@ def damaged(path: Path, how: str) -> None:
         path.write_bytes(content[:size])
 
 
-@pytest.mark.parametrize("how", ["deleted", "empty", "half", "one byte short"])
+EXTREMES = [pytest.param(how, marks=pytest.mark.slow) for how in ("empty", "one byte short")]
+
+
+@pytest.mark.parametrize("how", ["deleted", "half", *EXTREMES])
 def test_every_file_is_needed_or_its_damage_is_an_error(
     whole: Path, right: list[list[Arrays]], tmp_path: Path, rig: Rig, how: str
 ) -> None:
@@ -242,6 +245,8 @@ def test_nothing_is_recorded_over_episodes_whose_index_is_lost(out: Path, rig: R
     check_layout(out)
     assert checked(out) == []
     assert repair(out) == []
+    if lost != "meta":
+        return  # what is repaired is the same
     with Recorder(rig, out, fps=20, task="lift the cube") as recorder:
         record(recorder, 0.3)
         assert recorder.status().episode == 3

@@ -222,7 +222,7 @@ def test_a_rig_that_is_closed_first(out: Path) -> None:
 # Folders, names and values.
 
 
-@pytest.mark.parametrize("name", ["a b", "ä%03d?#&'\"", "x:y", "-rf", "{number}", "gone/far/away"])
+@pytest.mark.parametrize("name", ["-rf", "ä%03d?#&'\" x:y", "gone/{number}/away"])
 def test_any_folder_name_works(rig: Rig, tmp_path: Path, name: str) -> None:
     with Recorder(rig, tmp_path / name, task="") as recorder:
         record(recorder, 0.1)

@@ -20,7 +20,7 @@ from hal.geometry import after_rotation
 from hal.specs import RobotSpec, WorkspaceSpec
 from hal.types import Limited
 
-STREAMS = 2500 if os.environ.get("HAL_SOAK") == "1" else 10
+STREAMS = 2500 if os.environ.get("HAL_SOAK") == "1" else 6
 ROUNDING = 1e-6
 """Of differences of positions over a tick, m/s."""
 BOX = WorkspaceSpec((0.1, -0.5, 0.1), (0.75, 0.5, 0.9))

@@ -75,7 +75,7 @@ def expected_readings(path: Path) -> tuple[int, list[tuple[dict[str, float], lis
     ("name", "node", "events", "title", "flat"),
     [
         ("ds4", "/dev/input/event3", 93, "DualShock 4", 15 / 127.5),
-        ("dualsense", "/dev/input/event4", 64, "DualSense", 0.0),
+        pytest.param("dualsense", "/dev/input/event4", 64, "DualSense", 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_recorded_pad_is_read_completely(name, node, events, title, flat, tmp_path):

@@ -134,7 +134,7 @@ JSON = st.recursive(
 )
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.one_of(st.text(), JSON.map(json.dumps), st.fixed_dictionaries(dict.fromkeys(PAD, JSON)).map(json.dumps)))
 def test_any_text_is_a_record_or_malformed(text: str) -> None:
     try:
