@@ -19,13 +19,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -106,18 +108,19 @@ def random_goals(arm: hal.Robot, count: int, seed: int) -> list[Any]:
 
 @dataclass
 class Rest:
-    """Distances from the set-point: the greatest and the median, m and rad; and how many goals were reached."""
+    """How far from their set-points an arm rested."""
 
-    worst: tuple[float, float]
-    median: tuple[float, float]
-    reached: int
+    goals: list[Any]
+    """Joint positions (n,) of the goals that were reached, rad."""
+    errors: Any
+    """Distances (reached, 2) from the set-point there, m and rad."""
     missed: list[str]
-    """Why each of the other goals was not."""
+    """Why each of the other goals was not reached."""
 
 
 def rest(rig: hal.Rig, controller: Any, count: int, seed: int = 1) -> Rest:
     """Return the rest errors of random poses."""
-    arm, errors, missed = arm_of(rig), [], []
+    arm, errors, missed, reached = arm_of(rig), [], [], []
     unattended = arm.spec.attended
     for number, goal in enumerate(random_goals(arm, count, seed)):
         limited = hal.Limited.NONE
@@ -129,6 +132,7 @@ def rest(rig: hal.Rig, controller: Any, count: int, seed: int = 1) -> Rest:
                 if rig.clock.now() < begun + LONGEST:
                     follow(rig, control, goal, SETTLE)
                     errors.append(arm.state().tcp.distance(arm.fk(goal)))
+                    reached.append(goal)
                     continue
                 missed.append(f"goal {number}: {limited}, {np.abs(goal - arm.state().q_set).max():.2f} rad away")
         except hal.MotionStopped as stop:
@@ -136,8 +140,30 @@ def rest(rig: hal.Rig, controller: Any, count: int, seed: int = 1) -> Rest:
         if rig.world is not None:  # from where it was stopped, the way to the next one may be blocked as well
             rig.world.reset()
             rig.clock.sleep(0.2)
-    worst, median = np.max(errors, axis=0), np.median(errors, axis=0)
-    return Rest((worst[0], worst[1]), (median[0], median[1]), len(errors), missed)
+    return Rest(reached, np.array(errors), missed)
+
+
+def left_by_friction(arm: hal.Robot, controller: Any, q: Any, friction: Any) -> Any:
+    """Return how far (2,) from its set-point the tcp may rest because its joints stick, m and rad.
+
+    An arm sticks as soon as the torque on every joint is below its friction. The distances are those of springs that
+    exert just these torques, in the worst of their directions.
+
+    Args:
+        arm: The arm.
+        controller: The controller, with one stiffness for all directions, or one for each joint.
+        q: Where the arm rests (n,), rad.
+        friction: Coulomb friction of each joint (n,), Nm.
+    """
+    jacobian = arm.kinematics.jacobian(q)
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=len(q)))) * friction
+    if isinstance(controller, JointImpedance):
+        errors = corners / np.array(controller.stiffness) @ jacobian.T
+    else:
+        eased = np.linalg.solve(arm.dynamics.mass_matrix(q), jacobian.T)
+        stiffness = np.repeat([controller.stiffness, controller.rotation_stiffness], 3)
+        errors = corners @ eased @ np.linalg.inv(jacobian @ eased) / stiffness
+    return np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).max(axis=0)
 
 
 def tour(rig: hal.Rig, controller: Any, seconds: float) -> tuple[float, float, int]:
@@ -226,9 +252,33 @@ def held(rig: hal.Rig, controller: Any, seconds: float = 5.0) -> tuple[float, fl
         return fastest, control.tcp_speed, lead
 
 
-def steps(controller: Any, engine: str | None, seconds: float) -> float:
-    """Return the steps per second of a 20 Hz policy that moves the tcp, at 500 Hz physics."""
-    with open_rig("panda", engine=engine, hz=500.0) as rig:
+@contextlib.contextmanager
+def engine_timed() -> Iterator[list[float]]:
+    """Collect the time that each physics step takes in the engine itself, s."""
+    from hal.drivers.scene.world import SimulatedWorld
+
+    spent: list[float] = []
+
+    def timed(step: Callable[[Any], None]) -> Callable[[Any], None]:
+        def timed_step(world: Any) -> None:
+            begun = time.perf_counter()
+            step(world)
+            spent.append(time.perf_counter() - begun)
+
+        return timed_step
+
+    with contextlib.ExitStack() as stack:
+        for kind in SimulatedWorld.__subclasses__():
+            stack.enter_context(mock.patch.object(kind, "step", timed(kind.step)))
+        yield spent
+
+
+def steps(controller: Any, engine: str | None, seconds: float) -> tuple[float, float]:
+    """Return the steps per second of a 20 Hz policy that moves the tcp, at 500 Hz physics.
+
+    Also the median time of a physics step in the engine, s: what no program that uses it can save.
+    """
+    with open_rig("panda", engine=engine, hz=500.0) as rig, engine_timed() as spent:
         arm = arm_of(rig)
         with arm.control(controller=controller, rate_hz=20.0) as control:
             begun, start = 0.0, rig.clock.now()
@@ -238,7 +288,7 @@ def steps(controller: Any, engine: str | None, seconds: float) -> float:
                 arm.state()
                 begun = begun or time.perf_counter()
                 if time.perf_counter() - begun > seconds:
-                    return done / (time.perf_counter() - begun)
+                    return done / (time.perf_counter() - begun), float(np.median(spent))
     raise AssertionError
 
 
@@ -268,15 +318,19 @@ def steps_of_robosuite(python: str, seconds: float) -> float:
 def show_steps(args: argparse.Namespace) -> None:
     """Measure and print the steps per second, in turns, so that a busy computer slows all of them alike."""
     rates: dict[str, list[float]] = {}
+    engine: list[float] = []
     for _ in range(args.rounds):
         for name, controller in (("position", None), ("task", TASK), ("joints", JOINTS)):
-            rates.setdefault(name, []).append(steps(controller, args.engine, args.turn))
+            rate, spent = steps(controller, args.engine, args.turn)
+            rates.setdefault(name, []).append(rate)
+            engine.append(spent)
         if args.robosuite:
             rates.setdefault("robosuite", []).append(steps_of_robosuite(args.robosuite, args.turn))
     for name, found in rates.items():
         print(
             f"steps   {name:9s} {np.median(found):8.0f} steps/s at the median of {len(found)}, {max(found):.0f} at most"
         )
+    print(f"        each has 25 physics steps, which take {1e6 * np.median(engine):.0f} us each in the engine itself")
 
 
 def main() -> None:
@@ -340,20 +394,36 @@ def on_emulator(rows: list[str], args: argparse.Namespace) -> None:
     for name, controller in CONTROLLERS:
         if "rest" in rows:
             with emulated(args.emulator, args.host) as rig:
-                show_rest(f"emulated {args.emulator} {name}", rest(rig, controller, args.count))
+                found = rest(rig, controller, args.count)
+                show_rest(f"emulated {args.emulator} {name}", found)
+                show_friction(arm_of(rig), controller, found)
         if "tour" in rows:
             with emulated(args.emulator, args.host, "demo") as rig:
                 show_tour(f"emulated {args.emulator} {name}", tour(rig, controller, args.seconds))
 
 
 def show_rest(name: str, found: Rest) -> None:
-    worst, median = found.worst, found.median
+    worst, median = np.max(found.errors, axis=0), np.median(found.errors, axis=0)
     print(
-        f"rest    {name:22s} {found.reached} reached; at most {1e3 * worst[0]:.3f} mm and {worst[1]:.5f} rad, "
+        f"rest    {name:22s} {len(found.goals)} reached; at most {1e3 * worst[0]:.3f} mm and {worst[1]:.5f} rad, "
         f"median {1e3 * median[0]:.3f} mm and {median[1]:.5f} rad"
     )
     for text in found.missed:
         print(f"        {text}")
+
+
+def show_friction(arm: hal.Robot, controller: Any, found: Rest) -> None:
+    """Print what the emulated joints' friction alone may leave at the goals, and the most of it that was there."""
+    from hal.drivers.franka.emulator.plant import COULOMB
+
+    left = np.array([left_by_friction(arm, controller, goal, COULOMB) for goal in found.goals])
+    (most, turn), (median, turn_median) = left.max(axis=0), np.median(left, axis=0)
+    over = (left > (1e-3, 5e-3)).any(axis=1).sum()
+    print(
+        f"        friction may leave at most {1e3 * most:.3f} mm and {turn:.5f} rad, median {1e3 * median:.3f} mm and "
+        f"{turn_median:.5f} rad, and more than 1 mm or 0.005 rad at {over} goals; it left at most "
+        f"{(found.errors / left).max():.2f} of that"
+    )
 
 
 def show_tour(name: str, found: tuple[float, float, int]) -> None:

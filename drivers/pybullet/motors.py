@@ -187,6 +187,8 @@ class JointTorques:
         damping = [float(client.getJointInfo(body.id, joint)[6]) for joint in joints]
         self._damping: Array | None = np.array(damping) if any(damping) else None
         """Nm s/rad; None if no joint has any."""
+        self._positions = np.zeros(0)
+        """Of all joints of the body, at the start of the present step."""
         self._gravity: Floats = ()
         self._applied: Floats = [0.0] * len(self._joints)
         """Torques of the coming step, Nm."""
@@ -235,6 +237,7 @@ class JointTorques:
         """Start the next physics step, to which no torques are applied yet."""
         self._model.update()
         q, dq = self._state()
+        self._positions = q
         self._gravity = self._model.gravity(q)[self._places].tolist()
         if self._damping is not None:
             speeds = dq[self._places]
@@ -294,13 +297,13 @@ class JointTorques:
         self._applied, self._gravity = state["applied"], state["gravity"]
         self._external = np.array(state["external"])
         self._model.update()
+        self._positions, dq = self._state()
         if self._damping is not None:
-            self._weigh(*self._state())
+            self._weigh(self._positions, dq)
 
-    def mass_matrix(self, q: Floats) -> list[list[float]]:
+    def mass_matrix(self, q: Floats) -> Array:
         """Return the inertia matrix (n, n) at ``q`` (n,) rad, kg m2; the body's other joints keep their positions."""
         self._model.update()
-        everything, _ = self._state()
+        everything = self._positions.copy() if self._driving else self._state()[0]
         everything[self._places] = q
-        rows: list[list[float]] = self._model.inertia(everything)[self._block].tolist()
-        return rows
+        return self._model.inertia(everything)[self._block]

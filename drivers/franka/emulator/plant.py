@@ -120,7 +120,7 @@ def _named(model: Any, ending: str) -> str:
 
 VISCOUS = (0.5, 0.5, 0.5, 0.5, 0.2, 0.2, 0.2)
 """Viscous joint friction that remains after the robot's own compensation, Nm s/rad. Chosen here."""
-_COULOMB = (0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05)
+COULOMB = (0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05)
 """Coulomb friction that remains, Nm."""
 _STICKING = 1e-3
 """Speed below which Coulomb friction acts like viscous friction, rad/s."""
@@ -146,7 +146,7 @@ class Plant(ABC):
 
     def push(self, torques: Floats) -> None:
         """Advance one cycle under the client's torques (7,), Nm; the robot compensates gravity."""
-        friction = [a + b / (abs(v) + _STICKING) for a, b, v in zip(VISCOUS, _COULOMB, self.dq, strict=True)]
+        friction = [a + b / (abs(v) + _STICKING) for a, b, v in zip(VISCOUS, COULOMB, self.dq, strict=True)]
         self.dq = self.body.step(self.q, self.dq, torques, friction, DT)
         self.q = [p + v * DT for p, v in zip(self.q, self.dq, strict=True)]
         gravity = self.body.torques(self.q, (0.0,) * 7, (0.0,) * 7)
