@@ -19,8 +19,6 @@ from ..geometry import Pose
 from ..types import GripperOutcome
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from ..deadman import Deadman
     from ..gripper import Gripper, GripperMotion, GripperResult
     from ..robot import Robot
@@ -163,18 +161,30 @@ class SkillRun:
         skill: Name of the skill.
         arm: The arm.
         phases: Names of the phases, in order.
-        **options: See :class:`SkillOptions`.
+
+    The other arguments are the keys of :class:`SkillOptions`.
     """
 
-    def __init__(self, skill: str, arm: Robot, phases: Sequence[str], **options: Unpack[SkillOptions]) -> None:
+    def __init__(
+        self,
+        skill: str,
+        arm: Robot,
+        phases: Sequence[str],
+        *,
+        speed: float | None = None,
+        deadman: Deadman | None = None,
+        unattended: bool = False,
+        patience: float = 60.0,
+        timeout: float = _TIMEOUT,
+        progress: Callable[[SkillProgress], None] | None = None,
+    ) -> None:
+        check_deadman(deadman)
+        if patience != math.inf:
+            number("patience", patience, "s", least=0.0)
         self.arm = arm
-        self._skill, self._names, self._progress = skill, tuple(phases), options.get("progress")
-        self._deadman, self._unattended = options.get("deadman"), options.get("unattended", False)
-        check_deadman(self._deadman)
-        self._speed, self._patience = options.get("speed"), options.get("patience", 60.0)
-        if self._patience != math.inf:
-            number("patience", self._patience, "s", least=0.0)
-        self._timeout = number("timeout", options.get("timeout", _TIMEOUT), "s", least=0.0, above=True)
+        self._skill, self._names, self._progress = skill, tuple(phases), progress
+        self._deadman, self._unattended, self._patience, self._speed = deadman, unattended, patience, speed
+        self._timeout = number("timeout", timeout, "s", least=0.0, above=True)
         self._start = arm.clock.now()
         self._phases: list[SkillPhase] = []
         self._reason: Reason = ""

@@ -255,3 +255,8 @@ def test_a_gentle_grasp_tells_what_it_touched(rig: hal.Rig, reason: str, phase: 
     assert (0.02, 3.0) in closing, "the touch is slow, and hardly presses"
     if reason in ("missed", "wrong_width", "not_centred"):
         assert result.width == pytest.approx(0.08, abs=1e-3)
+
+
+def test_a_misspelt_option_is_an_error(rig: hal.Rig) -> None:
+    with pytest.raises(TypeError, match="spead"):
+        grasp(rig.robots["panda"], POSE, spead=0.1)  # type: ignore[call-arg]
