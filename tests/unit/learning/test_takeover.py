@@ -13,6 +13,7 @@ from hal.learning.policy import PolicyOutcome, PolicyRunner
 from hal.learning.takeover import Takeover
 
 Rig = hal.Rig
+SIDES = {"left": 0.6, "right": -0.6}
 
 
 @pytest.fixture
@@ -122,12 +123,29 @@ def test_a_gripper_that_the_policy_closed_stays_closed_in_a_takeover(rig: Rig) -
     assert max(widths[-40:]) < 0.002
 
 
+TWO = {"robots": {side: {"model": "panda", "base": {"position": [0.0, y, 0.0]}} for side, y in SIDES.items()}}
+SWING = hal.JointVelocity([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2])
+
+
+def test_an_arm_that_follows_rests_until_the_other_one_follows_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    follows, turns = hal.Control.hold_until_following, []
+
+    def follow(control: hal.Control) -> bool:
+        turns.append(control.robot.name)
+        if control.robot.name == "left" and turns.count("left") < 20:
+            control.send(hal.JointTarget(control.robot.state().q_set))
+            return False
+        return follows(control)
+
+    monkeypatch.setattr(hal.Control, "hold_until_following", follow)
+    with hal.open(TWO, driver="mock") as rig:
+        swing = dict.fromkeys(rig.robots, SWING)
+        outcome = PolicyRunner(rig, lambda _: swing, robots=rig.robots.values(), rate_hz=50, seconds=0.2).run()
+    assert (outcome.ended, outcome.reason) == ("time", "")
+
+
 def test_the_other_arm_rests_in_a_takeover_and_both_pause_with_the_dead_man() -> None:
-    robots = {
-        name: {"model": "panda", "base": {"position": [0.0, y, 0.0]}} for name, y in (("left", 0.6), ("right", -0.6))
-    }
-    swing = hal.JointVelocity([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2])
-    with hal.open({"robots": robots, "gamepads": {"pad": {"model": "auto"}}}, driver="mock") as rig:
+    with hal.open({**TWO, "gamepads": {"pad": {"model": "auto"}}}, driver="mock") as rig:
         pad, seen = rig.driver("pad"), []
         pad.press("l2")
 
@@ -142,7 +160,7 @@ def test_the_other_arm_rests_in_a_takeover_and_both_pause_with_the_dead_man() ->
 
         runner = PolicyRunner(
             rig,
-            lambda observation: dict.fromkeys(rig.robots, swing),
+            lambda observation: dict.fromkeys(rig.robots, SWING),
             robots=rig.robots.values(),
             rate_hz=50,
             seconds=2.0,
@@ -163,7 +181,7 @@ def test_the_other_arm_rests_in_a_takeover_and_both_pause_with_the_dead_man() ->
         with pytest.raises(hal.CommandError):
             PolicyRunner(
                 rig,
-                lambda observation: swing,
+                lambda observation: SWING,
                 robot=rig.robots["right"],
                 takeover=Takeover(hal.Teleop(rig.robots["left"]), rig.gamepads["pad"]),
             )
