@@ -140,7 +140,7 @@ def _main(args: argparse.Namespace) -> int:
 
 def is_remote(policy: str) -> bool:
     """Return whether a policy runs in another process."""
-    return policy.startswith(("ws://", "wss://", LEROBOT))
+    return "://" in policy or policy.startswith(LEROBOT)
 
 
 @contextlib.contextmanager
@@ -311,6 +311,8 @@ class RolloutRun:
         return next((self.marks[name] for name in self.pressed - before), None)
 
     def _episode(self, seed: int) -> PolicyOutcome:
+        from hal.errors import PolicyError
+
         number = len(self.outcomes)
         self._reset(number, seed)
         self.pressed = set(self.marks)
@@ -332,7 +334,7 @@ class RolloutRun:
         self._announce(f"episode {number}: {_describe(outcome)}")
         if self.recorder is not None and (trouble := self.recorder.status().trouble):
             self._announce(f"RECORDING: {trouble}")
-        if outcome.error is not None:
+        if outcome.error is not None and not isinstance(outcome.error, PolicyError):  # its text is enough
             self.line.clear()
             traceback.print_exception(outcome.error)
         return outcome

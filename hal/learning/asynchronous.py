@@ -40,6 +40,8 @@ _MARGIN = 1.0
 """Steps of the policy by which it is asked earlier than its latency requires."""
 _ONSET = 1e-3
 """A target must be due so much later than now, s."""
+_REHEARSAL_TIMEOUT = 60.0
+"""Longest wait for the answer of a rehearsal, s: some servers compile their policy at its first request."""
 _MOST_CAMERAS = 8
 """Greatest number of cameras that a server may ask for."""
 
@@ -138,10 +140,11 @@ class RemotePolicy:
             PolicyError: The server does not answer, speaks something else, or asks for what the policy's file lacks.
         """
         self._connect()
-        self._ask(observation, self.rig.clock.now())
+        longest = max(_REHEARSAL_TIMEOUT, self.client.timeout)
+        self._ask(observation, self.rig.clock.now(), longest)
         assert self._pending is not None
         reply, self._pending = self._pending.reply, None
-        actions = check_actions(self._result(reply), self._numbers)
+        actions = check_actions(self._result(reply, longest), self._numbers)
         self.config.decode(actions[:CHUNK_POINTS], observation, self._used)
         return None
 
@@ -267,15 +270,15 @@ class RemotePolicy:
             )
         return config
 
-    def _ask(self, observation: Observation, now: float) -> None:
+    def _ask(self, observation: Observation, now: float, timeout: float | None = None) -> None:
         request = self.config.request(observation, self._used, self.task)
         if self._rtc_delay is not None and (prefix := self._prefix(observation, now)) is not None:
             request["rtc"] = prefix
         if self._roboarena:
             request |= {"endpoint": "infer", "session_id": self._session_id}
-        self._pending = _Pending(self.client.request(request), observation, now)
+        self._pending = _Pending(self.client.request(request, timeout), observation, now)
         if self.rig.lock_step:  # the server computes now, whenever its answer is used
-            wait([self._pending.reply], self.client.timeout + 1.0)
+            wait([self._pending.reply], (timeout or self.client.timeout) + 1.0)
 
     def _prefix(self, observation: Observation, now: float) -> dict[str, Any] | None:
         """Return the actions of the present chunk from the observation on, and how many of them will be executed.
@@ -297,9 +300,9 @@ class RemotePolicy:
             "actions": self.config.encode(targets, observation, self._used).astype(np.float32),
         }
 
-    def _result(self, reply: Future[Any]) -> Any:
+    def _result(self, reply: Future[Any], timeout: float | None = None) -> Any:
         try:
-            return reply.result(self.client.timeout + 1.0)
+            return reply.result((timeout or self.client.timeout) + 1.0)
         except FutureTimeoutError:
             raise PolicyError(f"{self.client.url} does not answer", code="policy_timeout") from None
 

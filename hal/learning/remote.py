@@ -134,14 +134,14 @@ class PolicyClient:
             self._wait(self._connect(), 2.0 * CONNECT_TIMEOUT + 1.0)
         return self.metadata
 
-    def request(self, message: Mapping[str, Any]) -> Future[Any]:
-        """Send a request, and return the future of its reply.
+    def request(self, message: Mapping[str, Any], timeout: float | None = None) -> Future[Any]:
+        """Send a request, and return the future of its reply; ``timeout``, s, in place of the client's.
 
         A text is a reply, too: that to a reset, or an error (see :func:`check_actions`). The errors of the future are
         PolicyErrors: the server does not take the request and answer in time (code ``policy_timeout``), is gone
         (``policy_lost``), sends the traceback of an error (``policy_error``) or something else (``policy_protocol``).
         """
-        return asyncio.run_coroutine_threadsafe(self._request(pack(message)), self._loop)
+        return asyncio.run_coroutine_threadsafe(self._request(pack(message), timeout or self.timeout), self._loop)
 
     def close(self) -> None:
         """Close the connection and end the thread. Idempotent."""
@@ -183,20 +183,20 @@ class PolicyClient:
             )
         self.metadata = metadata
 
-    async def _request(self, packed: bytes) -> Any:
+    async def _request(self, packed: bytes, timeout: float) -> Any:
         if not self.connected:
             raise PolicyError(f"the connection to {self.url} is closed", code="policy_lost")
         if self._next is not None and self._next.done():
             await self._receive(0.0)  # raises an error if the connection is lost
             await self._disconnect()
             raise PolicyError(f"{self.url} sent a message that answers no request", code="policy_protocol")
-        end = self._loop.time() + self.timeout
+        end = self._loop.time() + timeout
         try:
-            await asyncio.wait_for(self._socket.send_bytes(packed), self.timeout)
+            await asyncio.wait_for(self._socket.send_bytes(packed), timeout)
         except asyncio.TimeoutError:  # the buffers are full: a cable is pulled, or the server is frozen
             await self._disconnect()
             raise PolicyError(
-                f"{self.url} did not take a request within {self.timeout:g} s", code="policy_timeout"
+                f"{self.url} did not take a request within {timeout:g} s", code="policy_timeout"
             ) from None
         except (OSError, RuntimeError) as error:
             await self._disconnect()
@@ -339,16 +339,17 @@ class PolicyServer:
         socket = aiohttp.web.WebSocketResponse(compress=False, max_msg_size=LARGEST)
         await socket.prepare(request)
         await socket.send_bytes(pack(self._metadata))
-        async for message in socket:
-            if message.type is not aiohttp.WSMsgType.BINARY:
-                break
-            try:
-                reply = await asyncio.get_running_loop().run_in_executor(None, self._reply, message.data)
-            except Exception:
-                await socket.send_str(traceback.format_exc())
-                await socket.close(code=aiohttp.WSCloseCode.INTERNAL_ERROR)
-                break
-            await (socket.send_str(reply) if isinstance(reply, str) else socket.send_bytes(reply))
+        with contextlib.suppress(ConnectionResetError):  # the client left before its answer
+            async for message in socket:
+                if message.type is not aiohttp.WSMsgType.BINARY:
+                    break
+                try:
+                    reply = await asyncio.get_running_loop().run_in_executor(None, self._reply, message.data)
+                except Exception:
+                    await socket.send_str(traceback.format_exc())
+                    await socket.close(code=aiohttp.WSCloseCode.INTERNAL_ERROR)
+                    break
+                await (socket.send_str(reply) if isinstance(reply, str) else socket.send_bytes(reply))
         return socket
 
     def _reply(self, data: bytes) -> bytes | str:
@@ -399,7 +400,9 @@ def check_actions(reply: Any, numbers: int) -> np.ndarray[Any, np.dtype[np.float
         actions = actions[0]
     if actions.ndim != 2 or not len(actions) or actions.shape[1] != numbers:
         raise PolicyError(
-            f"the policy's actions have the shape {actions.shape}, not (steps, {numbers})", code="policy_bad_actions"
+            f"the policy answers with actions of the shape {actions.shape}; its configuration, with this "
+            f"rig's arms, needs (steps, {numbers})",
+            code="policy_bad_actions",
         )
     if not math.isfinite(float(actions.sum())):
         raise PolicyError("the policy's actions have a number that is not finite", code="policy_bad_actions")

@@ -232,6 +232,27 @@ def test_an_error_of_the_policy_ends_the_run(folder: Path) -> None:
         assert text in done.stderr
 
 
+def test_an_error_of_a_policys_server_is_one_line(folder: Path) -> None:
+    pytest.importorskip("msgpack")
+    from hal.learning.remote import PolicyServer
+
+    (folder / "joints.yaml").write_text("rate_hz: 20\nobservation: {q: {state: q}}\naction: {kind: joint_position}\n")
+    requests: list[int] = []
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        requests.append(1)
+        if len(requests) == 3:
+            raise ValueError("out of memory")
+        return {"actions": np.tile(request["q"], (16, 1))}
+
+    with PolicyServer(infer) as server:
+        url = server.url.replace("ws", "http")
+        done = rollout("--policy", url, "--policy-config", "joints.yaml", "--seconds", 2.0, *FAST)
+    assert done.returncode == 1, done.stderr
+    assert "ValueError: out of memory" in report(folder)["ended"]
+    assert done.stderr == ""
+
+
 def test_an_arm_that_is_lost_between_episodes_keeps_the_results(folder: Path) -> None:
     options = ("--policy", "policies:Reach", "--reset", "policies:unplugged", "--seconds", 1.0, "--episodes", 3)
     done = rollout(*options, *FAST)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
@@ -270,6 +271,38 @@ def test_arms_that_do_not_fit_the_file_are_refused_with_both_sides(
     assert all(text in str(caught.value) for text in texts)
 
 
+def test_figures_count_late_and_steep_chunks_and_the_slowest_answer_counts_once(rig: Rig) -> None:
+    start, away, requests = np.array(rig.robots["panda"].state().q), 0.0, list[int]()
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        requests.append(1)
+        return {"actions": np.tile([start[0] + away, *start[1:], 0.0], (40, 1))}
+
+    with PolicyServer(infer) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG), latency=0.1)
+        policy.reset()
+
+        def chunk(seconds: float) -> Any:
+            rig.clock.sleep(seconds)
+            answer = policy(rig.observe(cameras=()))
+            assert isinstance(answer, dict)
+            return answer["panda"][0]
+
+        assert chunk(0.0) is None
+        first = chunk(0.6)
+        assert len(first.t) == 2 * 8, "an arm does not move for long after its server's death"
+        assert len(requests) == 2, "before the answer to the first request it is not known when to ask"
+        assert isinstance(chunk(0.12), hal.JointChunk)
+        assert len(requests) == 2, "the first answer of an episode, which is the slowest, is not expected again"
+        away = 0.16  # within the arm's reach in time, but more than it travels in a step of the policy
+        assert chunk(0.25) is None
+        assert isinstance(chunk(0.3), hal.JointChunk)
+        figures = policy.statistics()
+        policy.close()
+    assert (figures["chunks"], figures["late"], figures["steep"]) == (3, 1, 1)
+    assert abs(figures["splice"] - away) < 1e-6
+
+
 # Real-time chunking: a policy continues from what will be executed anyway.
 
 
@@ -394,6 +427,51 @@ def test_a_request_that_the_server_does_not_take_closes_the_connection(monkeypat
             client.request({}).result(5.0)
         assert not client.connected, "a later answer cannot pass for that to the next request"
         client.close()
+
+
+def test_the_answer_of_a_rehearsal_may_take_longer(rig: Rig) -> None:
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        time.sleep(0.2)  # as a policy that is compiled at its first request
+        return stay(request)
+
+    with PolicyServer(infer) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url, timeout=0.05), load_policy_config(CONFIG))
+        policy.rehearse(rig.observe(cameras=()))
+        policy.close()
+
+
+def test_a_client_that_left_before_its_answer_is_no_error_of_the_server() -> None:
+    aiohttp = pytest.importorskip("aiohttp")
+    asked, left, ended, errors = threading.Event(), threading.Event(), threading.Event(), list[BaseException]()
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        asked.set()
+        left.wait(10.0)
+        return {"actions": np.zeros((1, 1))}
+
+    class WatchedServer(PolicyServer):
+        async def _serve(self, request: Any) -> Any:
+            try:
+                return await super()._serve(request)
+            except BaseException as error:
+                errors.append(error)
+                raise
+            finally:
+                ended.set()
+
+    async def leave(url: str) -> None:
+        async with aiohttp.ClientSession() as session:
+            socket = await session.ws_connect(url, timeout=aiohttp.ClientWSTimeout(ws_close=0.01))
+            await socket.receive()
+            await socket.send_bytes(pack({}))
+            await asyncio.to_thread(asked.wait, 10.0)
+            await socket.close()
+
+    with WatchedServer(infer) as server:
+        asyncio.run(leave(server.url))
+        left.set()
+        assert ended.wait(10.0)
+    assert errors == []
 
 
 class TalkativeServer(PolicyServer):
