@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import CommandError, DatasetError
 from .dataset import Dataset, Episode
 from .foreign import is_foreign
-from .index import check_next_episode, dataset_errors, read_about, read_entries, read_index, read_tasks
+from .index import check_next_episode, dataset_errors, read_about, read_entries, read_index, read_tasks, stray_files
 from .layout import (
     BOOKKEEPING,
     SEGMENTATION,
@@ -123,17 +123,16 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
         return DatasetError(what, file=str(path.relative_to(layout.root)), episode=number)
 
     total, numbers = int(info["total_episodes"]), layout.numbers()
-    known, videos = set(), video_names(info["features"])
+    places: list[tuple[int, EpisodePlace]] = []
     for number in range(total):
         about: dict[str, Any] = {}
         if number not in numbers:
             yield wrong(layout.about(number), "is missing", number)
         with contextlib.suppress(DatasetError):  # reported with its row of the index
             about = read_about(layout, number)
-        known.update(layout.files_of(number, EpisodePlace.of(number, about), videos))
-    for path in layout.finished():
-        if path not in known:
-            yield wrong(path, "is not in the index")
+        places.append((number, EpisodePlace.of(number, about)))
+    for path in stray_files(layout, places, video_names(info["features"])):
+        yield wrong(path, "is not in the index")
     tasks: list[str] = []
     try:
         with dataset_errors(layout.root, layout.tasks):

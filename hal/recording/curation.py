@@ -161,6 +161,7 @@ class _TrimmedEpisode(Episode):
         return about | {
             "length": rows.end - rows.first,
             "t_start": float(about["t_start"]) + self._shift,
+            "dropped": None if about.get("dropped") is None else sum(gap["rows"] for gap in gaps),
             "gaps": [gap | times for gap, times in zip(gaps, shifted, strict=True)],
             "objects_at_start": objects,
             "trimmed": {"first": before["first"] + rows.first, "rows": before["rows"]},

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import weakref
+from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
@@ -45,6 +48,35 @@ class _Columns(dict[str, NDArray[Any]]):
     def __missing__(self, key: str) -> NDArray[Any]:
         file, episode = self._place
         raise DatasetError(f"has no column {key}", file=file, episode=episode)
+
+
+class _ColumnMemory:
+    """Forgets the columns of the episodes that were read first, when those of all need too much memory.
+
+    Args:
+        limit: Size of all columns, bytes.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self._used = 0
+        self._read: deque[tuple[weakref.ref[Episode], int]] = deque()
+        self._lock = threading.Lock()
+
+    def add(self, episode: Episode, columns: _Columns) -> None:
+        """Add the columns that an episode has just read."""
+        size = sum(values.nbytes for values in columns.values())
+        with self._lock:
+            self._used += size
+            while self._used > self.limit and self._read:
+                oldest, freed = self._read.popleft()
+                self._used -= freed
+                if (other := oldest()) is not None:
+                    other.__dict__.pop("columns", None)
+            self._read.append((weakref.ref(episode), size))
+
+
+_MEMORY = _ColumnMemory(500_000_000)
 
 
 class KeptRows(NamedTuple):
@@ -149,7 +181,10 @@ class Episode:
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Every column by its key: (rows, n), or (rows,) for a single number."""
+        """Every column by its key: (rows, n), or (rows,) for a single number.
+
+        They are read once, and once more if those of many other episodes were read meanwhile.
+        """
         found = _Columns(self.data_file, self.number)
         path = self._layout.root / self.data_file
         features = {key: each for key, each in self._meta["features"].items() if each["dtype"] != "video"}
@@ -166,6 +201,7 @@ class Episode:
             if str(values.dtype) != feature["dtype"] or values.size != self.length * int(np.prod(shape)):
                 raise self._wrong(path, f"{key} is not {feature['dtype']} {feature['shape']} in every row")
             found[current_key(key)] = values.reshape(-1, *shape)
+        _MEMORY.add(self, found)
         return found
 
     def read_table(self) -> Any:

@@ -30,6 +30,7 @@ from .index import (
     read_about,
     read_index,
     read_tasks,
+    stray_files,
     validated_info,
 )
 from .layout import (
@@ -499,14 +500,12 @@ def _layout(out: str | Path) -> DatasetLayout:
 
 def _rebuild(layout: DatasetLayout) -> int:
     """Write all of ``meta/`` again from the episodes, ``info.json`` last. Return the number of episodes."""
-    recorded = [path for path in layout.finished() if not path.is_relative_to(layout.info.parent)]
     count = max(layout.numbers(), default=-1) + 1
     info = _info(layout, count)
     episodes = [Episode(layout, number, info) for number in range(count)]
-    videos = video_names(info["features"])
-    known = {path for episode in episodes for path in layout.files_of(episode.number, episode.place, videos)}
-    for path in recorded:
-        if path not in known:
+    places = [(episode.number, episode.place) for episode in episodes]
+    for path in stray_files(layout, places, video_names(info["features"])):
+        if not path.is_relative_to(layout.info.parent):
             raise DatasetError("belongs to no episode in episodes/", file=str(path.relative_to(layout.root)))
     tasks: dict[int, str] = {}
     parts: dict[str, list[Stats]] = {}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import shlex
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,11 +25,13 @@ __all__ = [
     "read_tasks",
     "dataset_errors",
     "repair_command",
+    "stray_files",
     "validated_info",
 ]
 
 _SIDE = 16384
 """Pixels; no picture is larger."""
+_DISK_REFUSES = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 _TASK = "__index_level_0__"
 """LeRobot's name of the column of texts in ``meta/tasks.parquet``."""
 
@@ -149,12 +152,17 @@ def repair_command(layout: DatasetLayout) -> str:
 
 @contextlib.contextmanager
 def dataset_errors(root: Path, path: Path, episode: int | None = None) -> Iterator[None]:
-    """Raise any error of a missing or damaged file as a DatasetError that names the file and the episode."""
+    """Raise any error of a missing or damaged file as a DatasetError that names the file and the episode.
+
+    A disk that refuses what is written meanwhile is no damage: its OSError is raised as it is.
+    """
     try:
         yield
     except HalError:
         raise
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in _DISK_REFUSES:
+            raise
         file = str(path.relative_to(root)) if path.is_relative_to(root) else str(path)
         raise DatasetError(_reason(error), file=file, episode=episode) from error
 
@@ -247,6 +255,14 @@ def check_next_episode(layout: DatasetLayout, info: dict[str, Any] | None) -> No
                 file=str(path.relative_to(layout.root)),
                 code="index_wrong",
             )
+
+
+def stray_files(
+    layout: DatasetLayout, places: Iterable[tuple[int, EpisodePlace]], videos: Collection[str]
+) -> list[Path]:
+    """Return the files of finished episodes that belong to none of these (number, place)."""
+    known = {path for number, place in places for path in layout.files_of(number, place, videos)}
+    return [path for path in layout.finished() if path not in known]
 
 
 def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:

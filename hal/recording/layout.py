@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import fcntl
 import importlib.util
 import json
@@ -409,15 +410,19 @@ def file_version(path: Path) -> tuple[int, int] | None:
 
 
 @contextlib.contextmanager
-def lock_dataset(layout: DatasetLayout) -> Iterator[None]:
+def lock_dataset(layout: DatasetLayout, *, only_read: bool = False) -> Iterator[None]:
     """Hold the dataset's lock, so that no other process adds to it. The lock ends with the process.
+
+    Args:
+        layout: The dataset.
+        only_read: Whether nothing will be written into it: then its folder may be write-protected.
 
     Raises:
         CommandError: Another process holds it (code ``dataset_locked``), or ``episodes/`` is a link
             (``dataset_link``).
     """
     deadline = time.monotonic() + _PATIENCE
-    while (fd := _lock_now(layout)) is None:
+    while (fd := _lock_now(layout, only_read)) is None:
         if time.monotonic() > deadline:
             raise CommandError(f"another program is recording into {layout.root}", code="dataset_locked")
         time.sleep(0.05)
@@ -427,7 +432,7 @@ def lock_dataset(layout: DatasetLayout) -> Iterator[None]:
         os.close(fd)
 
 
-def _lock_now(layout: DatasetLayout) -> int | None:
+def _lock_now(layout: DatasetLayout, only_read: bool) -> int | None:
     """Return the open lock file of a dataset.
 
     None if another process holds it, or has put another dataset in this place since the file was opened.
@@ -438,7 +443,12 @@ def _lock_now(layout: DatasetLayout) -> int | None:
         raise CommandError(f"{layout.episodes} is a link; nothing is recorded through it", code="dataset_link")
     path, fd = layout.episodes / ".lock", None
     with contextlib.suppress(BlockingIOError, FileNotFoundError):
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        except OSError as error:
+            if not only_read or error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM) or not path.exists():
+                raise
+            fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.path.samestat(os.fstat(fd), path.stat()):
             return fd

@@ -1,7 +1,7 @@
 """Merge datasets that were recorded with the same rig into one, and curate a dataset: delete, extract, mark, re-task.
 
-Rows are renumbered, statistics are combined from those of the episodes, and videos and depth files become hard links to
-those of the parts: nothing is encoded again, and nothing is copied on the same file system.
+Rows are renumbered, statistics are combined from those of the episodes, and small videos are joined. Large videos,
+depth files and rows that stay as they are become hard links to those of the parts. Nothing is encoded again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from .codecs import (
 from .dataset import Dataset, Episode
 from .finish import entries_table, entry_row, last_row, new_info, stats_of, tasks_table, write_table
 from .foreign import is_foreign
-from .index import check_next_episode, dataset_errors, read_entries, read_tasks
+from .index import check_next_episode, dataset_errors, read_entries, read_tasks, stray_files
 from .layout import (
     CHUNK,
     GROUP,
@@ -135,7 +135,7 @@ def merge(
                     "and exported, and LeRobot's own tools edit it",
                     code="foreign_dataset",
                 )
-            locks.enter_context(lock_dataset(layout))
+            locks.enter_context(lock_dataset(layout, only_read=not (replaces and layout.root == target.root)))
             if layout.partials():
                 raise CommandError(
                     f"{layout.root} has an unfinished episode; finish it first, with recover()",
@@ -317,6 +317,10 @@ def _sources(
     datasets = [Dataset(layout.root) for layout in layouts]
     for layout, dataset in zip(layouts, datasets, strict=True):
         check_next_episode(layout, dataset.info)  # episodes that the index lacks would be lost
+        places = [(episode.number, episode.place) for episode in dataset.episodes]
+        if strays := stray_files(layout, places, video_names(dataset.info["features"])):
+            file = str(strays[0].relative_to(layout.root))
+            raise DatasetError("belongs to no episode and would be lost: move it", file=file, code="index_wrong")
     for dataset in datasets[1:]:
         found = format_differences(datasets[0].info, dataset.info) + _camera_differences(datasets[0], dataset)
         if found:
@@ -452,7 +456,8 @@ class _Builder:
         data.parent.mkdir(parents=True, exist_ok=True)
         kept = self._kept_rows(numbers)
         if kept is not None:
-            _link(kept, data)
+            with dataset_errors(self.sources[begin].dataset.root, kept):
+                _link(kept, data)
         else:
             self._write_rows(data, numbers)
         found, rows = [], []
@@ -522,7 +527,8 @@ class _Builder:
         for number in numbers:
             _, episode, label = self.sources[number]
             entry = self._entry(number)
-            known = self._tasks(episode._layout.tasks)
+            with dataset_errors(episode._layout.root, episode._layout.tasks):
+                known = self._tasks(episode._layout.tasks)
             if (
                 episode.rows is not None
                 or episode._layout.data(episode.place.data[0]) != path

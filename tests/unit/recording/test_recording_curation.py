@@ -129,7 +129,7 @@ def test_rows_can_be_chosen_and_metadata_follows(still: Dataset, tmp_path: Path)
     path = folder / "episodes/000000.json"
     about = json.loads(path.read_text())
     gaps = [{"from_s": t, "to_s": t + 0.05, "rows": 1, "why": "disk"} for t in (0.1, 0.8, 2.5)]
-    path.write_text(json.dumps(about | {"gaps": gaps}))
+    path.write_text(json.dumps(about | {"gaps": gaps, "dropped": 3}))
     rows = still.episodes[0].length
     for kept in (KeptRows(0, rows + 1), KeptRows(6, 6), KeptRows(-2, 9), KeptRows(7, 20)):  # 7 is no key frame
         with raises_code(CommandError, "bad_rows"):
@@ -146,6 +146,7 @@ def test_rows_can_be_chosen_and_metadata_follows(still: Dataset, tmp_path: Path)
     assert after.info["trimmed"] == {"first": 10, "rows": rows}
     (gap,) = after.info["gaps"]
     assert gap["from_s"] == pytest.approx(0.8 - 0.5, abs=1e-6)
+    assert after.info["dropped"] == 1
     assert after.info["rig"] == about["rig"]
     before = Path(shutil.copytree(out, tmp_path / "before"))
     kept = KeptRows(0, still.episodes[2].length - 2)
@@ -157,6 +158,18 @@ def test_rows_can_be_chosen_and_metadata_follows(still: Dataset, tmp_path: Path)
         drive(rig, 0.2)
         recorder.save(True, wait=True)
     assert list(check_dataset(Dataset(out))) == []
+
+
+def test_objects_start_in_the_first_row_that_is_kept(still: Dataset) -> None:
+    episode = Dataset(still.root).episodes[0]
+    poses = np.arange(7.0 * episode.length).reshape(-1, 7)
+    lost = np.where(np.arange(episode.length)[:, None] < 10, np.nan, poses)
+    episode.columns.update({"rig.object.cube": poses, "rig.object.lost": lost})
+    start = {"cube": [0.0] * 7, "lost": [1.0] * 7, "table": [2.0] * 7}
+    episode.info["objects_at_start"] = start
+    found = curation._TrimmedEpisode(episode, KeptRows(8, 20)).info["objects_at_start"]
+    assert found == start | {"cube": poses[8].tolist()}, "a table has no column, and a lost cube no pose"
+    assert episode.info["objects_at_start"]["cube"] == [0.0] * 7, "the recording's own stay"
 
 
 def test_a_split_has_every_episode_once(tmp_path: Path) -> None:

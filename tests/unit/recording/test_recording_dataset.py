@@ -17,7 +17,7 @@ from recording_kit import CAMERAS, check_layout, drive, kill_writer, mock_rig, r
 
 import hal
 from hal.errors import CommandError, DeviceNotFound, HalError
-from hal.recording import Dataset, Recorder, recover, repair
+from hal.recording import Dataset, Recorder, dataset, recover, repair
 from hal.recording.checking import check_dataset
 
 
@@ -52,6 +52,24 @@ def test_an_episode_has_the_metadata_of_its_source(made: Path) -> None:
     assert {"python", "numpy", "av", "pyarrow"} <= set(info["versions"])
     assert info["engine"] is None, "a mock has no world"
     assert info["gaps"] == []
+
+
+def test_columns_of_a_long_dataset_do_not_fill_the_memory(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second, third = Dataset(made).episodes
+    before = first.columns
+    size = sum(values.nbytes for values in before.values())
+    monkeypatch.setattr(dataset, "_MEMORY", dataset._ColumnMemory(2 * size))
+    for episode in (second, third):
+        episode.__dict__.pop("columns", None)
+    dataset._MEMORY.add(first, before)
+    assert second.columns is second.columns
+    assert first.columns is before, "both fit"
+    assert third.columns is third.columns
+    found = Dataset(made).episodes[0].columns
+    assert "columns" not in first.__dict__, "the one that was read first"
+    assert "columns" in third.__dict__
+    assert first.columns is not before
+    assert np.array_equal(first.columns["action"], found["action"])
 
 
 def test_rows_are_at_their_times_and_nothing_is_missing(made: Path) -> None:

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import resource
 import shutil
 from pathlib import Path
 from typing import Any
@@ -132,6 +133,65 @@ def test_what_cannot_be_merged_is_refused(part: Path, tmp_path: Path) -> None:
         merge([part, copy], out)
     assert damaged.value.episode == 1
     assert [path.name for path in tmp_path.iterdir()] == ["copy"], "nothing is left of the attempts"
+    assert delete_episodes(copy, [1]) == 1, "a damaged episode can be deleted"
+    assert not list(check_dataset(Dataset(copy)))
+
+
+@pytest.mark.parametrize("change", ["no metadata in between", "a file of nobody", "damaged tasks"])
+def test_what_would_lose_a_file_is_refused(part: Path, tmp_path: Path, change: str) -> None:
+    demo = Path(shutil.copytree(part, tmp_path / "demo"))
+    if change == "damaged tasks":
+        os.truncate(demo / "meta/tasks.parquet", 40)
+    elif change == "a file of nobody":
+        shutil.copy(demo / "depth/wrist/chunk-000/file-000.depth", demo / "depth/wrist/chunk-000/file-007.depth")
+    else:  # an older meta/info.json and a lost file: what is left of episode 3 would be removed
+        merge([part, part], tmp_path / "four")
+        shutil.copy(tmp_path / "four/episodes/000003.json", demo / "episodes")
+        shutil.rmtree(tmp_path / "four")
+    before = {path: path.stat().st_size for path in demo.rglob("*")}
+    with pytest.raises(DatasetError) as refused:
+        delete_episodes(demo, [0])
+    assert refused.value.file == {
+        "damaged tasks": "meta/tasks.parquet",
+        "a file of nobody": "depth/wrist/chunk-000/file-007.depth",
+    }.get(change, "episodes/000003.json")
+    assert {path: path.stat().st_size for path in demo.rglob("*")} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["demo"]
+
+
+@pytest.mark.parametrize("limit", [1_000, 12_000, 40_000])
+def test_a_full_disk_is_not_reported_as_a_damaged_file(part: Path, tmp_path: Path, limit: int) -> None:
+    """At the first limit videos cannot be written, at the second no rows, at the third no index."""
+    demo = Path(shutil.copytree(part, tmp_path / "demo"))
+    before = {path: path.stat().st_size for path in demo.rglob("*")}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        with pytest.raises(OSError, match="too large") as refused:
+            pack(demo)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert refused.value.errno == errno.EFBIG
+    assert {path: path.stat().st_size for path in demo.rglob("*")} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["demo"]
+
+
+def test_a_part_may_be_write_protected(part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    demo, opened = Path(shutil.copytree(part, tmp_path / "demo")), os.open
+
+    def protected(path: Any, flags: int, *rest: Any, **more: Any) -> int:
+        if flags & (os.O_RDWR | os.O_CREAT) and Path(str(path)).is_relative_to(demo):
+            raise OSError(errno.EROFS, "read-only file system")
+        return opened(path, flags, *rest, **more)
+
+    monkeypatch.setattr(layout_module.os, "open", protected)
+    assert merge([demo], tmp_path / "out") == 2
+    with pytest.raises(OSError, match="read-only"):
+        delete_episodes(demo, [0])
+    with lock_dataset(DatasetLayout(demo), only_read=True), monkeypatch.context() as patched:
+        patched.setattr(layout_module, "_PATIENCE", 0.0)
+        with raises_code(CommandError, "dataset_locked"):
+            merge([demo], tmp_path / "again")
 
 
 def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
