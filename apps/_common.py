@@ -370,7 +370,7 @@ def find_deadman(rig: Rig) -> tuple[Deadman, TeleopMapping]:
     """Return the dead-man of the rig's pad, and the pad's mapping.
 
     Raises:
-        CommandError: The rig has no pad.
+        CommandError: The rig has no pad (code ``no_gamepad``), or its pad's controls cannot be held (``cannot_hold``).
     """
     from hal.config.mapping import load_mapping
     from hal.errors import CommandError
@@ -379,6 +379,9 @@ def find_deadman(rig: Rig) -> tuple[Deadman, TeleopMapping]:
     if pad is None:
         message = f"{rig.plan.source} has no gamepad to hold as the dead-man; see --pad and --unattended"
         raise CommandError(message, code="no_gamepad")
+    if not pad.can_hold:
+        message = "keys of this terminal make one step for each press, and the dead-man must be held: use --pad web"
+        raise CommandError(message, code="cannot_hold")
     mapping = load_mapping(pad.mapping or "default")
     return pad.hold(mapping.deadman), mapping
 

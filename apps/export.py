@@ -38,7 +38,8 @@ def parser() -> argparse.ArgumentParser:
         dest="kind",
         required=True,
         choices=("robomimic", "zarr", "npz"),
-        help="robomimic: one HDF5 file; zarr: as diffusion policy's replay buffer; npz: one .npz per episode",
+        help="robomimic: one HDF5 file; zarr: as diffusion policy's replay buffer; npz: one .npz per episode; LeRobot "
+        "reads the dataset as it is",
     )
     made.add_argument("--out", metavar="PATH", help="output (default: beside the dataset)")
     made.add_argument("--force", action="store_true", help="overwrite if it exists")

@@ -22,7 +22,7 @@ PROGRAMS = {
     "check": "check this computer, real arms and cameras before they move; show gamepads, CAN adapters",
     "collect": "record demonstrations",
     "review": "view, check and repair a dataset",
-    "dataset": "list, delete, mark, re-task, extract and merge recorded episodes",
+    "dataset": "list, mark, delete, trim, merge, split and check recorded episodes",
     "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
     "serve-lerobot": "serve a policy that was trained with LeRobot, for rollout",
@@ -44,13 +44,13 @@ LISTS = {
 
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    programs = "\n".join(f"  {name:12s} {what}" for name, what in PROGRAMS.items())
+    programs = "\n".join(f"  {name:13s} {what}" for name, what in PROGRAMS.items())
     made = argparse.ArgumentParser(
         prog="hal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description=f"programs:\n{programs}\n\n"
-        f"  {'list':12s} list built-in files: {', '.join(LISTS)}\n"
-        f"  {'schema':12s} print the JSON schema of a rig's file, for editors",
+        f"  {'list':13s} list built-in files: {', '.join(LISTS)}\n"
+        f"  {'schema':13s} print the JSON schema of a rig's file, for editors",
         epilog="hal PROGRAM --help shows a program's own options.",
     )
     made.add_argument("--version", action="store_true", help="print the version")

@@ -81,7 +81,8 @@ def _main(args: argparse.Namespace) -> int:
 def _end_with_stdin() -> None:
     """End this process when standard input is closed, also while it loads a policy or computes."""
     with contextlib.suppress(OSError):
-        sys.stdin.buffer.read()
+        while os.read(0, 1024):  # not through sys.stdin, whose lock would abort an interpreter that ends meanwhile
+            pass
     os._exit(0)
 
 

@@ -19,7 +19,7 @@ DRIVER = DriverSpec(
     own_process=frozenset({"gripper"}),
     shared_options=("host",),
     requires={
-        "pylibfranka": "pip install 'robot-hal[franka]'",
+        "pylibfranka": "pip install 'robot-hal[franka]' (Python 3.10 to 3.12; there is no wheel for newer ones)",
         "panda_py": "pip install 'robot-hal[panda]'",
     },
 )

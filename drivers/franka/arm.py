@@ -24,6 +24,7 @@ from hal.lock import DeviceLock
 from hal.preflight import has_realtime_kernel
 from hal.specs import RobotSpec
 
+from . import DRIVER
 from .faults import ARM_PORT, fault_of, fault_of_exception, is_connection_lost
 from .flags import FLAGS
 from .link import ArmLink, ArmMode, ArmSample, StreamKind
@@ -310,9 +311,6 @@ class FrankaArm(RobotDriver):
         }
 
 
-_EXTRAS = {"fr3": "franka", "fer": "panda"}
-
-
 def create_link(arm: str) -> ArmLink:
     """Create a link to an arm, not connected yet. The vendor's library is imported here.
 
@@ -331,8 +329,9 @@ def create_link(arm: str) -> ArmLink:
 
         return PandaLink()
     except ImportError as error:
-        advice = f"install it with: pip install 'robot-hal[{_EXTRAS[arm]}]'"
-        raise DriverMissing(f"driver 'franka' does not import: {error}; {advice}", name=error.name) from error
+        advice = DRIVER.requires["pylibfranka" if arm == "fr3" else "panda_py"]
+        message = f"driver 'franka' does not import: {error}; install it with: {advice}"
+        raise DriverMissing(message, name=error.name) from error
 
 
 _RETRY_PERIOD = 0.5

@@ -271,7 +271,11 @@ class PolicyServer:
             metadata: What a client gets on connecting.
             host: Address to listen at.
             port: Port; 0 for a free one.
+
+        Raises:
+            DriverMissing: aiohttp or msgpack is not installed.
         """
+        _msgpack(), _aiohttp()
         self._infer, self._reset, self._metadata = infer, reset, dict(metadata or {})
         self._host, self.port = host, port
         self._loop = asyncio.new_event_loop()
@@ -346,6 +350,7 @@ class PolicyServer:
                 try:
                     reply = await asyncio.get_running_loop().run_in_executor(None, self._reply, message.data)
                 except Exception:
+                    traceback.print_exc()
                     await socket.send_str(traceback.format_exc())
                     await socket.close(code=aiohttp.WSCloseCode.INTERNAL_ERROR)
                     break

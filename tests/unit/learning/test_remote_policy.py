@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -501,6 +502,12 @@ def test_an_answer_out_of_turn_ends_the_episode(rig: Rig) -> None:
     assert outcome.error.code == "policy_protocol"
     assert outcome.statistics["chunks"] == 3
     assert_within_limits(rig)
+
+
+def test_a_server_without_its_library_does_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "msgpack", None)
+    with pytest.raises(hal.DriverMissing):
+        PolicyServer(stay)
 
 
 def test_no_server_is_an_error_before_anything_moves(rig: Rig) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from hal import registry
 from hal.drivers.franka import hand_motions
+from hal.drivers.franka.arm import create_link
 from hal.drivers.franka.emulator.hand_fingers import FingerMotion, FingerMotionKind, Fingers
 from hal.drivers.franka.emulator.hand_network import HandStatus
 from hal.drivers.franka.hand_motions import (
@@ -441,3 +442,9 @@ def test_a_missing_client_library_is_reported(monkeypatch):
     monkeypatch.delitem(sys.modules, "hal.drivers.franka.hand", raising=False)
     with pytest.raises(DriverMissing, match="panda"):
         registry.load("franka", "gripper")
+
+
+def test_the_remedy_for_a_missing_library_of_an_fr3_names_the_pythons_that_have_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "hal.drivers.franka.fr3", None)
+    with pytest.raises(DriverMissing, match=r"Python 3.10 to 3.12"):
+        create_link("fr3")
