@@ -362,11 +362,12 @@ class RemotePolicy:
             step, fastest = np.abs(new.targets[name].q[0] - planned), np.asarray(robot.limits.velocity)
             self._splice = max(self._splice, float(step.max()))
             steep = steep or bool((step > fastest * self._dt).any())
-            if (step > FIRST_STEP_ANGLE + fastest * (new.t[0] - now)).any():
-                joint = robot.joints[int(step.argmax())]
+            most = FIRST_STEP_ANGLE + fastest * (new.t[0] - now)
+            worst = int((step - most).argmax())
+            if step[worst] > most[worst]:
                 raise PolicyError(
-                    f"the policy's next chunk begins {step.max():.2f} rad away from the present one at {joint} of "
-                    f"{name}",
+                    f"the policy's next chunk begins {step[worst]:.2f} rad away from the present one at "
+                    f"{robot.joints[worst]} of {name}; it may be {most[worst]:.2f} rad",
                     code="policy_jump",
                 )
         self._steep += steep

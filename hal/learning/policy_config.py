@@ -17,8 +17,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..config.files import load_record
 from ..config.schema import Flag, Quantity, Strict, ValueProblem
-from ..errors import DeviceNotFound, NotSupported, PolicyError
-from ..geometry import Pose, quaternion_to_matrix
+from ..errors import DeviceNotFound, NotSupported, PolicyError, Unreachable
+from ..geometry import Pose, after_rotation, difference, quaternion_to_matrix
 
 if TYPE_CHECKING:
     from ..observation import Observation
@@ -204,16 +204,12 @@ class ActionConfig(Strict):
 
     def _follow_steps(self, actions: Array, tcp: Pose, q: Array, robot: Robot) -> Array:
         """Return the joint positions (k, n) of steps (k, 6) of the tcp, which begin at ``tcp`` and ``q``."""
-        from ..errors import Unreachable
-
-        found, rotation, position = [], quaternion_to_matrix(tcp.orientation), np.array(tcp.position)
+        found, position, orientation = [], np.array(tcp.position), tcp.orientation.tolist()
         for step in actions:
             position = position + self.scale * step[:3]
-            rotation = _turn(self.turn * step[3:]) @ rotation
-            matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = rotation, position
+            orientation = after_rotation(orientation, (self.turn * step[3:]).tolist())
             try:
-                q = robot.ik(Pose.from_matrix(matrix), q)
+                q = robot.ik(Pose(position, orientation), q)
             except Unreachable as error:
                 raise PolicyError(
                     f"the policy leads out of the arm's reach: {error}", code="policy_unreachable_pose"
@@ -415,7 +411,7 @@ def _state(name: str, observation: Observation, robot: Robot) -> Array:
     if name == "tcp_rpy":
         return _rpy(quaternion_to_matrix(state.tcp.orientation))
     if name == "tcp_rotvec":
-        return _rotation_vector(state.tcp.orientation)
+        return np.array(difference((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, *state.tcp.orientation))[3:])
     width = observation.grippers[robot.name].width
     if name == "width":
         return np.array([width])
@@ -439,23 +435,6 @@ def _picture(color: NDArray[np.uint8], source: Source) -> NDArray[np.uint8]:
     if source.mirror:
         color = color[:, ::-1]
     return np.ascontiguousarray(color.transpose(2, 0, 1) if source.layout == "chw" else color)
-
-
-def _turn(vector: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a rotation vector (3,), rad (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    half = np.sin(angle / 2.0) / angle * vector
-    return quaternion_to_matrix([*half, np.cos(angle / 2.0)])
-
-
-def _rotation_vector(quaternion: Array) -> Array:
-    """Return the rotation vector (3,), rad, at most pi long, of a quaternion x, y, z, w."""
-    x, y, z, w = quaternion if quaternion[3] >= 0.0 else -quaternion
-    sine = float(np.sqrt(x * x + y * y + z * z))
-    angle = 2.0 * float(np.arctan2(sine, w))
-    return np.array([x, y, z]) * (angle / sine if sine > 1e-12 else 2.0)
 
 
 def _rpy(matrix: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ import pytest
 from errors_kit import raises_code
 
 import hal
-from hal.geometry import quaternion_to_matrix
-from hal.learning.policy_config import PolicyConfig, _rotation_vector, _rpy, _turn, load_policy_config
+from hal.geometry import after_rotation
+from hal.learning.policy_config import PolicyConfig, load_policy_config
 
 CONFIG: dict[str, Any] = {
     "rate_hz": 15,
@@ -63,16 +64,21 @@ def test_numbers_are_scaled_and_moved_into_the_policys_frame() -> None:
     assert (picture["observation/image"] != plain["observation/image"]).any()
 
 
-def test_orientations_become_angles_and_rotation_vectors() -> None:
+def test_orientations_become_angles_and_rotation_vectors(rig: hal.Rig) -> None:
+    both = {"state": {"state": ["tcp_rotvec", "tcp_rpy"]}}
+    config, observation = load_policy_config({**CONFIG, "observation": both}), rig.observe(cameras=())
     half = np.sqrt(0.5)
     special = [[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [half, half, 0, 0], [0, half, 0, half], [0, -half, 0, half]]
     quaternions = np.concatenate([special, np.random.default_rng(1).normal(size=(50, 4))])
     for quaternion in quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True):
-        matrix, vector = quaternion_to_matrix(quaternion), _rotation_vector(quaternion)
-        assert np.linalg.norm(vector) <= np.pi + 1e-9
-        np.testing.assert_allclose(_turn(vector), matrix, atol=1e-9)
-        turned = hal.Pose.from_rpy([0.0, 0.0, 0.0], _rpy(matrix))
-        np.testing.assert_allclose(turned.matrix()[:3, :3], matrix, atol=1e-9)
+        pose = hal.Pose([0.0, 0.0, 0.0], quaternion)
+        state = {"panda": replace(observation.robots["panda"], tcp=pose)}
+        request = config.request(replace(observation, robots=state), rig.robots, "")
+        vector, rpy = np.split(request["state"].astype(float), 2)
+        assert np.linalg.norm(vector) <= np.pi + 1e-6
+        turned = hal.Pose([0.0, 0.0, 0.0], after_rotation([0.0, 0.0, 0.0, 1.0], vector.tolist()))
+        np.testing.assert_allclose(turned.matrix(), pose.matrix(), atol=1e-6)
+        np.testing.assert_allclose(hal.Pose.from_rpy([0.0, 0.0, 0.0], rpy).matrix(), pose.matrix(), atol=1e-6)
 
 
 def test_columns_of_a_recording_are_asked_for_and_answered_in_metres() -> None:
