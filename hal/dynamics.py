@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import NotSupported
+from .errors import CommandError, NotSupported
 from .geometry import rotate
 from .kinematics.arm import add_tcp, reduced_model
 from .kinematics.inertials import find_wrong_inertials
@@ -74,6 +74,7 @@ class Dynamics:
         self.spec = spec
         self.payload = payload
         self.n = len(spec.joints)
+        self._shape = (self.n,)
         self._pin: Any = pin
         self._model: Any = reduced_model(spec, pin, others)
         self._tcp = add_tcp(self._model, spec, pin)
@@ -179,6 +180,8 @@ class Dynamics:
 
     def _ordered(self, values: Floats) -> Array:
         array = np.array(values, float)
+        if array.shape != self._shape:
+            raise CommandError(f"one number for each joint is needed, shape {self._shape}, not {array.shape}")
         return array if self._inverse_columns is None else array[self._inverse_columns]
 
     def _in_order(self, array: Array) -> Array:

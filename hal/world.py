@@ -140,8 +140,17 @@ class World:
         return tuple(self._call("names"))
 
     def add(self, body: BodySpec) -> None:
-        """Add a body."""
-        self._edit("add", spec=to_json(body))
+        """Add a body; if it overlaps another one there, ``rig.notes`` says so.
+
+        Raises:
+            ConfigError: It cannot be loaded; lists every problem.
+            CommandError: Not a :class:`hal.BodySpec` (``code`` is ``not_a_body``).
+        """
+        given: object = body
+        if not isinstance(given, BodySpec):
+            text = "add takes a hal.BodySpec(name, position, orientation, shape, ...), not"
+            raise CommandError(f"{text} {type(given).__name__}", code="not_a_body")
+        self._edit("add", spec=to_json(given))
 
     def remove(self, name: str) -> None:
         """Remove a body. Robots cannot be removed."""
@@ -548,4 +557,6 @@ def _pose(data: Mapping[str, Any] | Sequence[Any]) -> Pose:
 
 
 def _plain(pose: Pose) -> dict[str, list[float]]:
+    if not isinstance(pose, Pose):
+        raise CommandError(f"pose must be a hal.Pose, not {type(pose).__name__}", code="not_a_pose")
     return {"position": pose.position.tolist(), "orientation": pose.orientation.tolist()}

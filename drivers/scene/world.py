@@ -10,6 +10,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
+from operator import gt
 from typing import Any
 
 from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupported, Problem
@@ -35,7 +36,7 @@ from .values import (
 __all__ = ["SimulatedWorld"]
 
 OVERLAP = 0.005
-"""Depth, m, from which on two arms that overlap at the start are refused."""
+"""Depth, m, from which on two arms that overlap at the start are refused, and objects that do are reported."""
 
 
 class SimulatedWorld(SceneEngine[B]):
@@ -141,6 +142,22 @@ class SimulatedWorld(SceneEngine[B]):
                 problems.append(Problem("simulation", f"robots.{b.name}", f"{message}; {remedy}", "robots_overlap"))
         if problems:
             raise ConfigError(problems)
+        self._report_overlaps(self.bodies.values())
+
+    def _report_overlaps(self, added: Iterable[B]) -> None:
+        """Warn of free objects among ``added`` that are inside of something: the solver pushes them out anywhere."""
+        loose = {body.name for body in added if body.floating and not body.carried}
+        boxes = {name: self._bounding_box(body) for name, body in self.bodies.items() if loose and not body.carried}
+        for one, other in combinations(boxes, 2):
+            if one not in loose:
+                one, other = other, one
+            (lower, upper), (least, most) = boxes[one], boxes[other]
+            if one not in loose or any(map(gt, lower, most)) or any(map(gt, least, upper)):
+                continue
+            depth = self._deepest_overlap(self.bodies[one], self.bodies[other])[0]
+            if depth > OVERLAP:
+                text = f"{one} starts {depth:.3f} m inside {other}, which may push it out to any side"
+                self.warnings.append(f"{text}: change its position")
 
     # --- requests of rig.world ---------------------------------------------------------------------------------------
 
@@ -359,6 +376,7 @@ class SimulatedWorld(SceneEngine[B]):
         if problems:
             raise ConfigError(problems)
         self._load([record])
+        self._report_overlaps([self.bodies[record.name]])
         return self._edited("add", spec=to_json(record))
 
     def remove(self, name: str) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arguments import vector
-from ..errors import CommandError
+from ..errors import CommandError, DeviceNotFound
 from ..geometry import Pose, difference
 from . import ik
 from .urdf import parse_xml
@@ -55,6 +55,7 @@ class Kinematics:
 
         self.spec = spec
         self.n = len(spec.joints)
+        self._shape = (self.n,)
         self.lower: Array = np.array(spec.lower, float)
         self.upper: Array = np.array(spec.upper, float)
         self.home: Array = np.array(spec.home, float)
@@ -101,7 +102,7 @@ class Kinematics:
         return Pose(values[:3], values[3:])
 
     def link_pose(self, link: str, q: Sequence[float] | Array) -> Pose:
-        """Return the pose of a link's frame (not its centre of mass). Raises KeyError for an unknown link."""
+        """Return the pose of a link's frame (not its centre of mass). Raises DeviceNotFound (``unknown_link``)."""
         frame = self._body_frame(link)
         self._forward(q)
         self._pin.updateFramePlacement(self._model, self._data, frame)
@@ -120,8 +121,8 @@ class Kinematics:
             link: A link whose frame replaces the tcp's; its columns of joints farther out are 0. None: the tcp.
 
         Raises:
-            KeyError: No such link.
-            CommandError: No such frame.
+            DeviceNotFound: No such link (``code`` is ``unknown_link``).
+            CommandError: No such frame, or another number of joints.
         """
         if frame == "base":
             axes = self._axes
@@ -324,11 +325,14 @@ class Kinematics:
         if frame >= self._model.nframes:
             links = [f.name for f in self._model.frames if f.type == self._pin.FrameType.BODY]
             near = difflib.get_close_matches(link, links, 3) or links
-            raise KeyError(f"no link {link!r} in {Path(self.spec.urdf).name}; did you mean {', '.join(near)}?")
+            text = f"no link {link!r} in {Path(self.spec.urdf).name}; did you mean {', '.join(near)}?"
+            raise DeviceNotFound(text, code="unknown_link")
         return frame
 
     def _ordered(self, q: Sequence[float] | Array) -> Array:
         values = np.array(q, float)
+        if values.shape != self._shape:
+            raise CommandError(f"q must have shape {self._shape}, not {values.shape}")
         return values if self._inverse_columns is None else values[self._inverse_columns]
 
     def _forward(self, q: Sequence[float] | Array) -> None:

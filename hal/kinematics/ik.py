@@ -77,8 +77,9 @@ def solve(
         return min(found, key=lambda q: float(np.abs(q - seed).max()))
     assert closest is not None
     position_error, rotation_error = _errors(arm.pose_error(closest.q, target))
+    few = f"; with {len(seed)} joints the tcp cannot take every orientation" if len(seed) < 6 else ""
     raise Unreachable(
-        f"no joint position inside the limits brings the tcp to {pose!r}",
+        f"no joint position inside the limits brings the tcp to {pose!r}{few}",
         position_error=position_error,
         rotation_error=rotation_error,
         q=tuple(closest.q.tolist()),

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..camera import Camera
@@ -32,6 +31,14 @@ from ..rig import Rig, open_rig
 from ..robot import Robot
 from ..specs import CameraSpec
 from .episode import reset_scene, stands_in_world
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.spaces import Box, Dict
+except ImportError as error:
+    text = "RigEnv needs gymnasium; install with: pip install 'robot-hal[gym]'"
+    raise DriverMissing(text, name="gymnasium") from error
 
 if TYPE_CHECKING:
     from ..servo.controllers import Controller
@@ -208,14 +215,6 @@ def pose_array(pose: Pose) -> NDArray[np.float64]:
     return np.concatenate([pose.position, pose.orientation])
 
 
-try:
-    import gymnasium
-    from gymnasium.spaces import Box, Dict
-except ImportError as error:
-    text = "RigEnv needs gymnasium; install with: pip install 'robot-hal[gym]'"
-    raise DriverMissing(text, name="gymnasium") from error
-
-
 Result = tuple[ObservationDict, dict[str, Any]]
 
 _MAX_LEAD = (0.03, 0.12)
@@ -352,6 +351,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
                 f"render_mode {render_mode!r}: use rgb_array, the first camera's picture", code="render_mode"
             )
         self.render_mode = render_mode
+        for argument, names in (("cameras", cameras), ("streams", streams), ("objects", objects)):
+            if isinstance(names, str):
+                raise CommandError(f"{argument} must be a list of names: [{names!r}]", code="not_a_list")
         self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
         self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
         self._unattended, self._controller = unattended, controller
@@ -485,7 +487,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             try:
                 arm.control.send(command, grip=grip)
             except MotionStopped as stop:
-                stopped = stopped or (f"{arm.robot.name}: {stop}" if len(self._arms) > 1 else str(stop))
+                stopped = stopped or (f"{arm.robot.name}: {stop.reason}" if len(self._arms) > 1 else stop.reason)
         now = clock.now()
         self._due = max(self._due + 1.0 / self._rate, now)  # a late turn is not caught up
         clock.sleep_until(self._due)

@@ -480,7 +480,8 @@ class Dataset:
         foreign = read_foreign(layout) if is_foreign(layout) else None
         info = read_index(layout) if foreign is None else foreign.info
         if info is None or info["total_episodes"] == 0:
-            raise CommandError(f"there is no episode in {layout.root}{_hint(layout)}", code="no_episodes")
+            missing = "" if layout.root.is_dir() else ", which does not exist"
+            raise CommandError(f"there is no episode in {layout.root}{missing}{_hint(layout)}", code="no_episodes")
         self.root = layout.root
         self.info: dict[str, Any] = info
         """``meta/info.json``."""

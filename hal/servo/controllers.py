@@ -72,7 +72,7 @@ class JointImpedance:
 
     Args:
         stiffness: Nm/rad, one number or one for each joint. By default four times the joint's torque limit per rad, at
-            most 200 Nm/rad.
+            most 200 Nm/rad, and all softer by one factor where the arm's inertia at the servo's rate allows no more.
         damping_ratio: 1 for critical damping: as fast as possible without overshoot.
         rate: Instead of ``stiffness``: 1/s2, times the inertia. Every joint then answers equally fast, and a joint of
             little inertia, such as a wrist's, with next to no force.
@@ -95,11 +95,13 @@ class OperationalSpace:
     Args:
         stiffness: Of the tcp's position, N/m: one number, or three along x, y and z. 1000 N/m by default.
         rotation_stiffness: Of its orientation, Nm/rad: one number, or three about x, y and z. 50 Nm/rad by default.
+            Where both are left out, both are softer by one factor if the arm's inertia at the servo's rate allows no
+            more.
         damping_ratio: 1 for critical damping: as fast as possible without overshoot.
         frame: Axes of the gains: those of the arm's ``base``, or of the ``tcp`` itself.
         position_only: Leave the orientation free; only the posture's stiffness holds it.
         posture: Joint positions (n,), rad, that the null space moves towards; the set-point's own by default.
-        posture_stiffness: Nm/rad of each joint, in the null space only.
+        posture_stiffness: Nm/rad of each joint, in the null space only. 10 Nm/rad by default, or less likewise.
         rate: Instead of ``stiffness``: 1/s2, times the inertia at the tcp, as robosuite's ``kp``.
         rotation_rate: The same for the orientation. Pass both rates or none.
     """
@@ -110,7 +112,7 @@ class OperationalSpace:
     frame: Literal["base", "tcp"] = "base"
     position_only: bool = False
     posture: tuple[float, ...] | None = None
-    posture_stiffness: float = 10.0
+    posture_stiffness: float | None = None
     rate: Gain | None = None
     rotation_rate: Gain | None = None
 
@@ -118,7 +120,8 @@ class OperationalSpace:
         _check_gains(self, ("stiffness", "rotation_stiffness", "rate", "rotation_rate"), 3)
         if self.frame not in ("base", "tcp"):
             raise CommandError(f"frame must be 'base' or 'tcp', not {self.frame!r}", code="bad_controller")
-        number("posture_stiffness", self.posture_stiffness, "Nm/rad", least=0.0, most=_STIFFEST)
+        if self.posture_stiffness is not None:
+            number("posture_stiffness", self.posture_stiffness, "Nm/rad", least=0.0, most=_STIFFEST)
         if self.posture is not None:
             object.__setattr__(self, "posture", tuple(vector("posture", self.posture).tolist()))
         rates = (self.rate is not None, self.rotation_rate is not None)
@@ -164,8 +167,11 @@ def controller_of(data: dict[str, Any] | None) -> Controller:
     return made
 
 
+_GAINS = ("stiffness", "rotation_stiffness", "rate", "rotation_rate")
 _FASTEST = 1.0
 """Greatest product of a mode's natural frequency and the servo's period: beyond it no damping is stable."""
+_FASTEST_POSTURE = 0.6
+"""The same for the default posture at a damping ratio of 1, which is stable up to 0.82."""
 _DAMPED = 0.9
 """Most that a damper may take of a speed in one period of the servo."""
 
@@ -203,15 +209,32 @@ def resolve(
         )
     dynamics = Dynamics.of(spec)
     mass = np.array(dynamics.mass_matrix(spec.home)) + np.diag(dynamics.damping) * (simulated / rate_hz)
-    law = ControllerLaw(resolved, n, 1.0 / rate_hz)
-    fastest = law.fastest(np.asarray(np.linalg.inv(mass), np.float64), kinematics.jacobian(spec.home)) / rate_hz
-    if fastest > _FASTEST:
-        raise CommandError(
-            f"{spec.name}: these gains are too stiff for the inertia of {spec.model} at {rate_hz:g} Hz: divide them by "
-            f"{1.1 * (fastest / _FASTEST) ** 2:.1f}, or run the servo at {1.05 * rate_hz * fastest / _FASTEST:.0f} Hz",
-            code="bad_controller",
-        )
-    return resolved
+    inverse, jacobian = np.asarray(np.linalg.inv(mass), np.float64), kinematics.jacobian(spec.home)
+    if isinstance(resolved, OperationalSpace) and resolved.posture_stiffness is None:
+        most = _stiffest_posture(resolved.position_only, inverse, jacobian, rate_hz)
+        resolved = replace(resolved, posture_stiffness=min(10.0, most))
+    fastest = ControllerLaw(resolved, n, 1.0 / rate_hz).fastest(inverse, jacobian) / rate_hz
+    if fastest <= _FASTEST:
+        return resolved
+    divisor = 1.1 * (fastest / _FASTEST) ** 2
+    names = [name for name in _GAINS if getattr(resolved, name, None) is not None]
+    if all(getattr(controller, name) is None for name in names):
+        softer: dict[str, Any] = {name: tuple(x / divisor for x in getattr(resolved, name)) for name in names}
+        return replace(resolved, **softer)
+    gains = " and ".join(f"{name} {max(getattr(resolved, name)):g}" for name in names)
+    raise CommandError(
+        f"{spec.name}: {gains} are too stiff for the inertia of {spec.model} at {rate_hz:g} Hz: divide them by "
+        f"{divisor:.1f}, or run the servo at {1.05 * rate_hz * fastest / _FASTEST:.0f} Hz (simulation.physics_hz)",
+        code="bad_controller",
+    )
+
+
+def _stiffest_posture(position_only: bool, inverse: Array, jacobian: Array, rate_hz: float) -> float:
+    """Return the greatest stiffness of the posture, Nm/rad, that is damped well in the null space at this rate."""
+    rows = jacobian[: 3 if position_only else 6]
+    task = np.linalg.pinv(rows @ inverse @ rows.T, rcond=1e-9, hermitian=True)
+    ease = inverse - inverse @ rows.T @ task @ rows @ inverse
+    return (_FASTEST_POSTURE * rate_hz) ** 2 / max(float(np.linalg.eigvalsh(ease)[-1]), _SLOWEST)
 
 
 def _resolve_joints(controller: JointImpedance, spec: RobotSpec, n: int) -> JointImpedance:
@@ -264,10 +287,9 @@ def with_gains(controller: Controller, gains: dict[str, ArrayLike]) -> Controlle
         if name not in known:
             text = f"{type(controller).__name__} has no gain {name!r} to change; gains: {', '.join(sorted(known))}"
             raise CommandError(text, code="bad_controller")
-        if name.endswith(("stiffness", "rate")) and getattr(controller, name) is None:
-            raise CommandError(
-                f"{name}: stiffnesses and rates do not change places in a session", code="bad_controller"
-            )
+        if name in _GAINS and getattr(controller, name) is None:
+            text = f"{name}: a session that began with stiffnesses takes no rates, nor the other way round"
+            raise CommandError(text, code="bad_controller")
     changed: Controller = replace(controller, **gains)  # type: ignore[arg-type]  # checked by the record
     return changed
 
@@ -370,6 +392,7 @@ class ControllerLaw:
         first = controller.rate if by_rate else controller.stiffness
         second = controller.rotation_rate if by_rate else controller.rotation_stiffness
         gains = (*_tuple(first), *(() if controller.position_only else _tuple(second)))
+        assert controller.posture_stiffness is not None, "resolve a controller first"
         return np.array([*gains, controller.damping_ratio, controller.posture_stiffness])
 
     def set_gains(self, controller: Controller) -> None:

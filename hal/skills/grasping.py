@@ -243,7 +243,8 @@ def close_on(run: SkillRun, width: float | None, force: float | None) -> None:
     if rests <= NOTHING:
         run.fail("missed", f"{gripper.name} closed on nothing")
     wanted = "" if width is None else f" instead of {width:.3f} m"
-    run.fail("wrong_width", f"{gripper.name} closed on something that is {rests:.3f} m wide{wanted}")
+    text = f"{gripper.name} closed on something that is {rests:.3f} m wide{wanted}"
+    run.fail("wrong_width", f"{text}; if it was the table, grasp higher (clearance= of grasp_pose)")
 
 
 def lift_up(run: SkillRun, lift: float, hold: float) -> None:

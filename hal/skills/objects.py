@@ -127,7 +127,7 @@ def _widest(points: Array, start: float, end: float) -> tuple[float, float]:
     return float(middle), float(np.median(0.5 * (lower[wide] + upper[wide])))
 
 
-def grasp_pose(found: LocatedObject, gripper: Gripper, *, depth: float = 0.03, clearance: float = 0.012) -> Pose:
+def grasp_pose(found: LocatedObject | None, gripper: Gripper, *, depth: float = 0.03, clearance: float = 0.012) -> Pose:
     """Return the pose of the tcp that grasps an object from above, across its narrowest way.
 
     The tcp's z axis points down and its fingers close along its y axis, as those of the Franka Hand do.
@@ -136,11 +136,15 @@ def grasp_pose(found: LocatedObject, gripper: Gripper, *, depth: float = 0.03, c
         found: The object.
         gripper: The gripper.
         depth: Greatest distance of the tcp below the top of the object, m: the room between fingertips and palm.
-        clearance: Least distance of the tcp from the table, m.
+        clearance: Least distance of the tcp from the table, m. More for fingers that come forward as they close: 0.03
+            for a Robotiq 2F-85.
 
     Raises:
-        CommandError: The object is wider than the gripper opens (``code`` is ``too_wide``).
+        CommandError: The object is wider than the gripper opens (``code`` is ``too_wide``), or ``found`` is None,
+            because no object was found (``not_seen``).
     """
+    if found is None:
+        raise CommandError("no object was found, so there is nothing to grasp", code="not_seen")
     if found.width > gripper.width_max:
         text = f"the object is {found.width:.3f} m wide; {gripper.name} opens to {gripper.width_max:.3f} m"
         raise CommandError(text, code="too_wide")

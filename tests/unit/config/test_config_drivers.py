@@ -291,6 +291,9 @@ def test_links_have_names_that_fit_every_model() -> None:
         (camera,) = load({"robots": {"arm": {"model": model}}, "cameras": {"eye": eye}}).resolve().cameras
         assert camera.view is not None
         assert camera.view.link == link
+        load(
+            "panda_table", overrides=[f"robots.panda.model={model}"]
+        ).resolve()  # its camera is on the hand of any model
     config = {"robots": {"arm": {"model": "panda"}}, "cameras": {"eye": eye}}
     config["cameras"]["eye"]["attached"]["link"] = "hnd"  # type: ignore[index]
     with raises_problems("unknown_link"):

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from specs import data, panda
 
 from hal.config import load
 from hal.config.data_files import data_folder
 from hal.dynamics import STANDARD_GRAVITY, Dynamics
-from hal.errors import NotSupported
+from hal.errors import CommandError, NotSupported
 from hal.geometry import Pose
 from hal.kinematics import Kinematics
 from hal.kinematics.inertials import find_wrong_inertials
@@ -98,6 +99,8 @@ def test_inverse_dynamics_are_inertia_times_acceleration_plus_gravity(tmp_path: 
     (_, l2), (_, m2) = LENGTHS, MASSES
     assert mass[1, 1] == pytest.approx(m2 * l2**2 / 3)
     assert np.array(dynamics.inverse(q, (0.0, 0.0), ddq)) == pytest.approx(mass @ ddq + dynamics.gravity(q))
+    with raises_code(CommandError, "bad_command"):
+        dynamics.gravity((0.0,) * 3)
 
 
 def test_coriolis_torques_are_in_inverse_dynamics(tmp_path: Path) -> None:

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 
-from hal.errors import CommandError, Unreachable
+from hal.errors import CommandError, DeviceNotFound, Unreachable
 from hal.geometry import Pose, quaternion_to_matrix
 from hal.kinematics.arm import NEAR_SINGULAR, Kinematics
 from hal.specs import KinematicsSpec
@@ -307,7 +308,7 @@ def test_bad_seed_and_unknown_link_are_named(panda: Kinematics) -> None:
         panda.solve(pose, [0.0] * 6)
     with pytest.raises(CommandError, match="q_seed (must have shape|holds)"):
         panda.solve(pose, [math.nan] * 7)
-    with pytest.raises(KeyError, match="panda_hand"):
+    with pytest.raises(DeviceNotFound, match="panda_hand"):
         panda.link_pose("panda_hnad", panda.home)
 
 
@@ -410,8 +411,11 @@ def test_an_unknown_frame_and_an_unknown_link_are_refused(panda: Kinematics) -> 
     with pytest.raises(CommandError) as caught:
         panda.jacobian(panda.home, "world")  # type: ignore[arg-type]  # the mistake
     assert caught.value.code == "unknown_frame"
-    with pytest.raises(KeyError):
+    with raises_code(DeviceNotFound, "unknown_link"):
         panda.jacobian(panda.home, link="panda_link55")
+    for wrong in ([0.0] * 6, [[0.0] * 7]):
+        with raises_code(CommandError, "bad_command"):
+            panda.jacobian(wrong)  # type: ignore[arg-type]  # the mistake
 
 
 @pytest.mark.parametrize("link", [None, "panda_link4"])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import os
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -20,6 +22,19 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from hal.learning.gym import RigEnv  # noqa: E402
 
 BARE = ("cameras={}",)
+
+
+def test_a_missing_gymnasium_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, "hal.learning.gym")
+    with raises_code(hal.DriverMissing, "driver_missing"):
+        importlib.import_module("hal.learning.gym")
+
+
+@pytest.mark.parametrize("argument", ["cameras", "streams", "objects"])
+def test_one_name_in_place_of_a_list_is_refused(argument: str) -> None:
+    with raises_code(hal.CommandError, "not_a_list"):
+        RigEnv("panda_table", **{argument: "cube"})  # type: ignore[arg-type]  # the mistake
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*")
@@ -273,6 +288,7 @@ def test_a_stop_truncates_with_its_reason_and_a_reset_does_not_acknowledge_it() 
         *_, truncated, info = env.step(np.zeros(7, np.float32))
         assert truncated
         assert "rig.stop()" in info["stopped"]
+        assert "control.rearm" not in info["stopped"], "an environment has no session to rearm"
         before = env.robot.state().q
         for _ in range(2):  # a training loop that does not notice the stop
             with raises_code(hal.MotionStopped, hal.Trip.STOP.code):

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from numpy.typing import NDArray
 from specs import panda
 from torque_kit import NOTHING, Driven, N, wheels
@@ -174,6 +175,26 @@ def test_new_gains_take_effect_within_the_ramp() -> None:
 def test_gains_out_of_range_are_refused(gains: dict[str, float]) -> None:
     with pytest.raises(CommandError):
         with_gains(resolve(JointImpedance(), SPEC, KINEMATICS, 240.0), gains)
+
+
+@pytest.mark.parametrize("controller", [OperationalSpace(), JointImpedance()], ids=["task", "joints"])
+def test_default_gains_suit_every_arm_and_those_that_were_passed_are_refused(controller: Controller) -> None:
+    """At 50 Hz the defaults of a Panda are too stiff, as those of a light arm are at 240 Hz."""
+    gains = ("stiffness", "rotation_stiffness")
+    usual, soft = resolve(controller, SPEC, KINEMATICS, 1000.0), resolve(controller, SPEC, KINEMATICS, 50.0)
+    passed = {name: getattr(usual, name) for name in gains if hasattr(usual, name)}
+    shares = [np.divide(getattr(soft, name), passed[name]) for name in passed]
+    assert np.concatenate(shares) == pytest.approx(shares[0][0])
+    assert shares[0][0] < 0.9
+    assert resolve(soft, SPEC, KINEMATICS, 50.0) == soft
+    with raises_code(CommandError, "bad_controller"):
+        resolve(type(controller)(**passed), SPEC, KINEMATICS, 50.0)
+
+
+def test_a_light_joint_in_the_null_space_has_a_softer_posture() -> None:
+    found = [resolve(OperationalSpace(position_only=True), SPEC, KINEMATICS, hz) for hz in (20.0, 240.0)]
+    assert 0.0 < getattr(found[0], "posture_stiffness") < 10.0  # noqa: B009  # of a union
+    assert getattr(found[1], "posture_stiffness") == 10.0  # noqa: B009
 
 
 def test_an_inertia_that_no_arm_has_is_refused() -> None:

@@ -120,6 +120,13 @@ def test_what_cannot_be_located_or_held_is_refused(rig: hal.Rig) -> None:
         locate_by_truth(rig, arm, "floor")
     with raises_code(hal.CommandError, "is_robot"):
         locate_by_truth(rig, arm, "panda")
+    with raises_code(hal.CommandError, "not_seen"):
+        grasp_pose(None, arm.gripper)
+    for wrong in ({"name": "it", "shape": "box"}, "cube"):
+        with raises_code(hal.CommandError, "not_a_body"):
+            rig.world.add(wrong)  # type: ignore[arg-type]  # the mistake
+    with raises_code(hal.CommandError, "not_a_pose"):
+        rig.world.set_pose("cube", [0.0, 0.0, 1.0])  # type: ignore[arg-type]  # the mistake
     with raises_code(hal.CommandError, "too_wide"):
         grasp_pose(object_from_points(box((0.1, 0.09, 0.05), 0.0, (0.4, 0.0)), TABLE), arm.gripper)
     with hal.open("panda_table", driver="mock", pad="none", overrides=["cameras={}"]) as mock:

@@ -257,6 +257,16 @@ class TestBadInput:
             assert "'left'" in problem.message
         engine.world(panda("left"), replace(panda("right"), driver="franka")).close()  # a copy of a real arm
 
+    def test_a_free_object_inside_of_another_one_is_a_warning(self, engine: Engine) -> None:
+        table = box("table", (0.5, 0.0, 0.1), (0.2, 0.2, 0.1))
+        on_it = cube((0.5, 0.1, 0.23))
+        world = engine.world(floor(), table, on_it, box("low", (0.5, -0.1, 0.22), (0.03, 0.03, 0.03), mass=0.1))
+        (warning,) = world.warnings
+        assert all(word in warning for word in ("low", "0.010 m", "table"))
+        world.add(replace(on_it, name="other", position=(0.52, 0.1, 0.23)))
+        assert [text.split()[0] for text in world.warnings] == ["low", "other"]
+        world.close()
+
     def test_a_link_without_mass_is_a_warning(self, engine: Engine, tmp_path: Path) -> None:
         urdf = tmp_path / "massless.urdf"
         urdf.write_text(
