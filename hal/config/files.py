@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -153,24 +154,35 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
         problems.add(path, "", f"cannot be read: {error}", "unreadable")
         return None
     try:
-        check_size(text)
-        loader = _Loader(text)
-        try:
-            node = loader.get_single_node()
-            if node is None:
-                problems.add(path, "", "is empty", "wrong_type")
-                return None
-            _find_duplicates(node, (), path, problems, set())
-            data = plain_copy(loader.construct_document(node))
-        finally:
-            loader.dispose()
+        data, twice = _read_document(text)
     except yaml.YAMLError as error:
         problems.add(path, "", yaml_problem(error), getattr(error, "code", "bad_yaml"))
         return None
+    for key, message in twice:
+        problems.add(path, key, message, "duplicate_key")
     if not isinstance(data, dict):
-        problems.add(path, "", f"must be keys and values, not {describe(data)}", "wrong_type")
+        problem = "is empty" if data is _EMPTY else f"must be keys and values, not {describe(data)}"
+        problems.add(path, "", problem, "wrong_type")
         return None
-    return data
+    return plain_copy(data)  # type: ignore[no-any-return]
+
+
+_EMPTY = object()
+
+
+@lru_cache(maxsize=64)  # the files of a rig, which an app may open again and again
+def _read_document(text: str) -> tuple[Any, tuple[tuple[str, str], ...]]:
+    """Return the data of a document, ``_EMPTY`` if it has none, and the keys that are given twice, with messages."""
+    check_size(text)
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return _EMPTY, ()
+        twice = tuple(_find_duplicates(node, (), set()))
+        return loader.construct_document(node), twice
+    finally:
+        loader.dispose()
 
 
 def parse_yaml(text: str) -> Any:
@@ -234,7 +246,7 @@ def check_size(text: str, loader: Any = _SafeLoader) -> None:
             raise _TooLarge(problem=f"more than {MAX_VALUES} values, those behind aliases included", problem_mark=mark)
 
 
-def _find_duplicates(node: yaml.Node, place: tuple[str, ...], path: Path, problems: Problems, seen: set[int]) -> None:
+def _find_duplicates(node: yaml.Node, place: tuple[str, ...], seen: set[int]) -> Iterator[tuple[str, str]]:
     if id(node) in seen:  # an alias
         return
     seen.add(id(node))
@@ -243,13 +255,15 @@ def _find_duplicates(node: yaml.Node, place: tuple[str, ...], path: Path, proble
         for key, value in node.value:
             name, line = str(getattr(key, "value", key)), key.start_mark.line + 1
             if name in lines and name != "<<":
-                message = f"is given twice, in lines {lines[name]} and {line}; names must be unique"
-                problems.add(path, ".".join((*place, name)), message, "duplicate_key")
+                yield (
+                    ".".join((*place, name)),
+                    f"is given twice, in lines {lines[name]} and {line}; names must be unique",
+                )
             lines.setdefault(name, line)
-            _find_duplicates(value, (*place, name), path, problems, seen)
+            yield from _find_duplicates(value, (*place, name), seen)
     elif isinstance(node, yaml.SequenceNode):
         for k, item in enumerate(node.value):
-            _find_duplicates(item, (*place, str(k)), path, problems, seen)
+            yield from _find_duplicates(item, (*place, str(k)), seen)
 
 
 # Records. A wrong value leaves a hole in its record, so that everything else can still be checked.

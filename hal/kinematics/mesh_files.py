@@ -70,7 +70,8 @@ def mesh_file(name: str, folder: Path) -> Path:
 def mesh_near(name: str, folder: Path) -> Path | None:
     """Return the file in ``folder`` or in a folder above it, where PyBullet looks, whatever package a URI names."""
     plain = _plain(name)
-    return next((place / plain for place in (folder, *folder.parents) if (place / plain).is_file()), None)
+    places = (folder, *folder.parents)
+    return next((place / plain for place in places if os.path.isfile(os.path.join(place, plain))), None)
 
 
 def _plain(name: str) -> str:

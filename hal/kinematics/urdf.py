@@ -11,7 +11,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from xml.parsers import expat
@@ -181,7 +181,20 @@ def read_urdf(path: Path, *, meshes: bool = True) -> UrdfModel:
         ValueError: It, or a mesh that it names, is wrong; the message does not name ``path``.
         OSError: It cannot be read.
     """
-    robot = parse_xml(path)
+    data, folder = path.read_bytes(), path.resolve().parent
+    model, files = _read(data, path, folder)
+    if any(mesh_file(name, folder) != file for name, file in files.items()):  # they were moved since
+        model, files = _read.__wrapped__(data, path, folder)
+    if meshes:
+        for name, file in files.items():
+            _check_mesh(name, file)
+    return model
+
+
+@lru_cache(maxsize=16)  # opening a rig reads its arms several times
+def _read(data: bytes, path: Path, folder: Path) -> tuple[UrdfModel, dict[str, Path]]:
+    """Return a model, and the file of each mesh that it names."""
+    robot = _parse(data)
     if robot.tag != "robot":
         raise ValueError(f"is not a URDF: its root element is <{robot.tag}>, not <robot>")
     links = {_name(element): element for element in robot.findall("link")}
@@ -202,13 +215,11 @@ def read_urdf(path: Path, *, meshes: bool = True) -> UrdfModel:
         _check_numbers(element)
     found = {name: _joint(element) for name, element in joints.items()}
     _check_tree(links, found)
-    folder = path.resolve().parent
-    if meshes:
-        for name in dict.fromkeys(mesh.get("filename", "") for mesh in robot.iter("mesh")):
-            _check_mesh(name, folder)
     colors = _named_colors(robot)
-    drawn = {name: _link(element, colors, folder) for name, element in links.items()}
-    return UrdfModel(path, MappingProxyType(drawn), MappingProxyType(found))
+    meshes = dict.fromkeys(mesh.get("filename", "") for mesh in robot.iter("mesh"))
+    files = {name: mesh_file(name, folder) for name in meshes}
+    drawn = {name: _link(element, colors, files) for name, element in links.items()}
+    return UrdfModel(path, MappingProxyType(drawn), MappingProxyType(found)), files
 
 
 def parse_xml(path: Path | str) -> ElementTree.Element:
@@ -218,7 +229,10 @@ def parse_xml(path: Path | str) -> ElementTree.Element:
         ValueError: It is not valid XML.
         OSError: It cannot be read.
     """
-    data = Path(path).read_bytes().lstrip()  # a blank line before the declaration is common, though no XML
+    return _parse(Path(path).read_bytes())
+
+
+def _parse(data: bytes) -> ElementTree.Element:
     builder = ElementTree.TreeBuilder()
     parser = expat.ParserCreate()
     parser.buffer_text = True
@@ -226,7 +240,7 @@ def parse_xml(path: Path | str) -> ElementTree.Element:
     parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.data
     try:
-        parser.Parse(data, True)
+        parser.Parse(data.lstrip(), True)  # a blank line before the declaration is common, though no XML
         return builder.close()
     except (expat.ExpatError, LookupError, ValueError) as error:  # LookupError: an encoding that Python lacks
         raise ValueError(f"is not valid XML, so not a URDF: {error}") from None
@@ -312,13 +326,12 @@ def _check_numbers(owner: ElementTree.Element) -> None:
                 raise ValueError(f"{place}axis xyz={text!r}> is not a direction")
 
 
-def _check_mesh(name: str, folder: Path) -> None:
+def _check_mesh(name: str, file: Path) -> None:
     """Check a mesh file if it exists; a driver that needs a missing one reports it.
 
     Meshes of installed packages are trusted, as their code is: checking them would take up to a second.
     """
     try:
-        file = mesh_file(name, folder)
         if file.is_file() and not is_installed(file):
             check_mesh(file)
     except ValueError as error:
@@ -395,10 +408,10 @@ def _named_colors(robot: ElementTree.Element) -> _Colors:
     return colors
 
 
-def _link(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfLink:
+def _link(element: ElementTree.Element, colors: _Colors, files: Mapping[str, Path]) -> UrdfLink:
     inertial = element.find("inertial")
     visuals, collisions = (
-        tuple(shape for shape in (_shape(one, colors, folder) for one in element.findall(kind)) if shape is not None)
+        tuple(shape for shape in (_shape(one, colors, files) for one in element.findall(kind)) if shape is not None)
         for kind in ("visual", "collision")
     )
     return UrdfLink(
@@ -411,7 +424,7 @@ def _link(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfLi
     )
 
 
-def _shape(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfVisual | None:
+def _shape(element: ElementTree.Element, colors: _Colors, files: Mapping[str, Path]) -> UrdfVisual | None:
     material, geometry = element.find("material"), element.find("geometry")
     rgba = colors.get(material.get("name", "")) if material is not None else None
     if material is not None and (own := material.find("color")) is not None:
@@ -421,8 +434,8 @@ def _shape(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfV
         return None
     pose = _origin(element)
     if shape.tag == "mesh":
-        file = mesh_file(shape.get("filename", ""), folder)
-        return UrdfVisual(pose, "mesh", _floats(shape, "scale", (1.0, 1.0, 1.0))[:3], rgba, str(file))
+        file = str(files[shape.get("filename", "")])
+        return UrdfVisual(pose, "mesh", _floats(shape, "scale", (1.0, 1.0, 1.0))[:3], rgba, file)
     if shape.tag == "box":
         return UrdfVisual(pose, "box", _floats(shape, "size", (0.0, 0.0, 0.0)), rgba)
     if shape.tag in ("sphere", "cylinder", "capsule"):

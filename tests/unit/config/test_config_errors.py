@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from hal.calibration.board import BoardConfig
 from hal.config import load
 from hal.config.data_files import find_data
+from hal.config.files import Problems, read_yaml
 from hal.config.mapping import TeleopMapping
 from hal.config.models import CameraModel, RobotModel
 from hal.config.objects import ObjectConfig
@@ -291,6 +292,15 @@ def test_missing_file_and_unknown_rig(tmp_path: Path) -> None:
 def test_files_that_are_no_rig(tmp_path: Path, text: str, code: str) -> None:
     (tmp_path / "rig.yaml").write_text(text)
     assert only(tmp_path / "rig.yaml").code == code
+
+
+def test_what_a_caller_changes_in_read_data_is_not_read_again(tmp_path: Path) -> None:
+    path, problems = tmp_path / "a.yaml", Problems()
+    path.write_text("a: {b: [1]}")
+    for _ in range(2):
+        data = read_yaml(path, problems)
+        assert data == {"a": {"b": [1]}}
+        data["a"]["b"].append(2)
 
 
 def test_keys_that_are_given_twice(tmp_path: Path) -> None:

@@ -108,3 +108,22 @@ def test_prefixes_that_the_file_does_not_declare(tmp_path: Path) -> None:
     assert root.findall("transmission")[0].attrib == {"xacro:at": "tip"}
     spec = KinematicsSpec(str(file), ("first",), (-1.0,), (1.0,), (0.0,), None, "tip", (0.0,) * 3, (0.0, 0.0, 0.0, 1.0))
     assert Kinematics(spec).fk([0.0])[:3] == pytest.approx((0.0, 0.0, 1.0))
+
+
+def test_a_changed_file_and_a_moved_mesh_are_read_again(tmp_path: Path) -> None:
+    def read() -> tuple[float | None, str]:
+        link = read_urdf(path).links["a"]
+        return link.mass, link.visuals[0].file
+
+    text = '<robot name="x"><link name="a"><inertial><mass value="1"/></inertial><visual><geometry>'
+    text += '<mesh filename="a.ply"/></geometry></visual></link></robot>'
+    path = tmp_path / "arms" / "a.urdf"
+    path.parent.mkdir()
+    path.write_text(text)
+    assert read() == (1.0, str(path.parent / "a.ply"))
+    (tmp_path / "a.ply").touch()
+    assert read() == (1.0, str(tmp_path / "a.ply"))
+    path.write_text(text.replace("1", "2"))
+    assert read()[0] == 2.0
+    (path.parent / "a.ply").touch()
+    assert read() == (2.0, str(path.parent / "a.ply"))
