@@ -77,7 +77,8 @@ class CollisionModel:
         import pinocchio as pin
 
         self._pin: Any = pin
-        scene = _scene(tuple((r.name, r.kinematics, r.base_position, r.base_orientation) for r in robots), spec)
+        arms = ((r.name, r.same or r.name, r.kinematics, r.base_position, r.base_orientation) for r in robots)
+        scene = _scene(tuple(arms), spec)
         self._scene = scene
         self._data: Any = scene.model.createData()
         self._geometry_data: Any = pin.GeometryData(scene.geometry)
@@ -228,7 +229,8 @@ class PairBounds:
 
 # The scene: built once for each set of arms and boxes.
 
-_Arm = tuple[str, "KinematicsSpec", tuple[float, float, float], tuple[float, float, float, float]]
+_Arm = tuple[str, str, "KinematicsSpec", tuple[float, float, float], tuple[float, float, float, float]]
+"""Names of an arm and of its robot, kinematics, and pose of the base."""
 
 
 @dataclass(frozen=True)
@@ -273,14 +275,14 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
     import coal
     import pinocchio as pin
 
-    loaded = [_arm_shapes(kinematics, _changed(kinematics.urdf)) for _, kinematics, _, _ in arms]
+    loaded = [_arm_shapes(kinematics, _changed(kinematics.urdf)) for _, _, kinematics, _, _ in arms]
     model, geometry = pin.Model(), pin.GeometryModel()
     several = len(arms) > 1
     owners: list[str] = []
     place: list[tuple[int, int, str]] = []  # arm (-1 for a box), joint of the whole model, link
     columns: list[int] = []
     slices: list[slice] = []
-    for a, ((name, kinematics, position, orientation), shapes) in enumerate(zip(arms, loaded, strict=True)):
+    for a, ((name, _, kinematics, position, orientation), shapes) in enumerate(zip(arms, loaded, strict=True)):
         base = pin.XYZQUATToSE3(np.array([*position, *Pose((0, 0, 0), orientation).orientation]))
         first = model.njoints - 1
         model = pin.appendModel(model, _renamed(shapes.model, f"{a}/"), 0, base)
@@ -313,7 +315,7 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
             margin = min(margin, _SHARE_AT_HOME * apart)
         elif a >= 0 and b >= 0 and not spec.arms:
             continue
-        elif 0 in (joint_a, joint_b) and a >= 0 and b >= 0 and _one_robot(arms[a], arms[b]):
+        elif 0 in (joint_a, joint_b) and a >= 0 and b >= 0 and arms[a][1] == arms[b][1]:
             continue  # each arm's own pairs have the robot's body
         alone = moved_by[i] != moved_by[j]
         if not alone.any():  # neither moves the other: two bases, or a base and a box
@@ -336,11 +338,6 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
         margins=np.array(margins, float),
         notes=tuple(f"{arms[0][0]}: {note}" for note in loaded[0].notes) if spec.own else (),
     )
-
-
-def _one_robot(one: _Arm, other: _Arm) -> bool:
-    """Return whether two arms are of one URDF in one place."""
-    return one[1].urdf == other[1].urdf and one[2:] == other[2:]
 
 
 def _changed(urdf: str) -> int:

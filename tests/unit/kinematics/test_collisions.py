@@ -121,6 +121,17 @@ def test_near_pairs_are_those_that_a_full_computation_finds(panda: RobotSpec) ->
     assert seen > 0
 
 
+def test_arms_of_one_robot_keep_off_its_body_once_whatever_their_tools(panda: RobotSpec, tmp_path: Path) -> None:
+    other = tmp_path / "with_another_tool.urdf"
+    other.write_bytes(Path(panda.kinematics.urdf).read_bytes())
+    second = replace(panda, name="second", same=panda.name, kinematics=replace(panda.kinematics, urdf=str(other)))
+    model = CollisionModel([panda, second], CollisionSpec())
+    pairs = [model.pair(k, 0.0) for k in range(model.count)]
+    between = [pair for pair in pairs if pair.first.partition("/")[0] != pair.second.partition("/")[0]]
+    assert between
+    assert not any("panda_link0" in str(pair) for pair in between)
+
+
 def test_two_arms_see_each_other_where_they_are() -> None:
     left, right = arms("panda", "panda", apart=1.0)
     at = np.array(right.home)
