@@ -45,7 +45,7 @@ _PROBE = 2e-3
 _SIDEWAYS = 0.005
 """A motion is sideways if shapes approach by less than this share of the greatest speed that its joints allow."""
 _NOISE = 1e-3
-"""A measured arm that is inside a margin may come so much nearer, m: its position is not exact."""
+"""A measured arm that begins inside a margin, or at it, may come so much nearer, m: its position is not exact."""
 
 
 class CollisionGuard:
@@ -300,7 +300,8 @@ class _Surroundings:
 class MeasuredGuard:
     """Checks where an arm is that follows torques, and so may not be where its set-point is.
 
-    Its stop is predicted. A pair that is inside its margin when the torques begin may come no nearer.
+    Its stop is predicted. A pair that is inside its margin when the torques begin, or at it, may come no nearer than
+    :data:`_NOISE`, and no nearer by each begin until it has parted.
 
     Args:
         model: As for :class:`CollisionGuard`.
@@ -309,17 +310,20 @@ class MeasuredGuard:
 
     def __init__(self, model: CollisionModel, others: Sequence[Neighbour]) -> None:
         self._around = _Surroundings(model, others, model.margins)
+        self._least: list[float] = model.margins.tolist()
+        """Smallest distance allowed for each other pair, m."""
         self._floors: dict[int, float] = {}
-        """Smallest distance allowed for each pair that is inside its margin, m."""
+        """Smallest distance allowed for each pair that began inside its margin, or at it, m."""
 
     def start(self, q: Floats, share: float) -> None:
         """Start to check an arm that is at ``q`` (n,), rad, with this share of the margins."""
         around = self._around
-        around.least = share * around.model.margins
-        self._floors.clear()
+        self._least = (share * around.model.margins).tolist()
+        around.least = share * around.model.margins + _NOISE
+        before, self._floors = self._floors, {}
         near = around.near(q, [0.0] * len(q))
         for k, now in zip(near, around.lowest(near, [q]), strict=True):
-            self._floors[k] = min(float(around.least[k]), now - _NOISE)
+            self._floors[k] = min(self._least[k], max(now - _NOISE, min(now, before.get(k, -inf))))
 
     def is_clear(self, q: Floats, way: float) -> bool:
         """Return whether no pair can get near within ``way`` (rad, all joints together) of ``q`` (n,)."""
@@ -342,7 +346,7 @@ class MeasuredGuard:
         present, ahead = around.lowest(near, [q]), around.lowest(near, places)
         allowed = True
         for k, now, then in zip(near, present, ahead, strict=True):
-            least = float(around.least[k])
+            least = self._least[k]
             floor = self._floors.get(k, least)
             if floor < least and now - _NOISE > floor:
                 self._floors[k] = floor = min(least, now - _NOISE)

@@ -199,6 +199,26 @@ def test_a_measured_arm_inside_a_margin_may_only_leave_and_not_come_back(panda: 
     assert not arm.measured.allows(away, [arm.q])
 
 
+def test_a_measured_arm_at_its_margin_may_tremble(panda: RobotSpec) -> None:
+    arm = MeasuredArm(panda, 2e-4)
+    assert arm.measured.allows(arm.q, [arm.lower(5e-4)])
+    assert not arm.measured.allows(arm.q, [arm.lower(2e-3)])
+
+
+def test_a_measured_arm_creeps_no_nearer_by_beginning_again_and_again(panda: RobotSpec) -> None:
+    arm = MeasuredArm(panda, 2e-4)
+    for step in (9e-4, 3e-4, 3e-4, 3e-4):  # the first one ends where it may tremble to
+        lower = arm.lower(step)
+        assert arm.measured.allows(arm.q, [lower]) == (step == 9e-4)
+        arm.q = lower
+        arm.measured.start(arm.q, 1.0)
+        assert arm.measured.allows(arm.q, [arm.lower(-1e-3)])
+    arm.q = arm.lower(-0.02)
+    arm.measured.start(arm.q, 1.0)
+    assert arm.measured.allows(arm.q, [arm.lower(0.017)])
+    assert not arm.measured.allows(arm.q, [arm.lower(0.019)])
+
+
 def test_a_compliant_arm_is_checked_off_its_set_point(panda: RobotSpec) -> None:
     arm = MeasuredArm(panda, 0.02, 0.5)
     still = [0.0] * 7
