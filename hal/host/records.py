@@ -103,7 +103,7 @@ class ServoRecord(NamedTuple):
     progress: float = 0.0
     """Share of that motion that is done, from 0 to 1."""
     off_path: bool = False
-    """Whether the arm was moved too far off the path of that motion to continue."""
+    """Whether the arm cannot continue on the path of that motion: it was moved too far off, or no plan leads on."""
 
 
 class StateLayout:

@@ -179,7 +179,9 @@ class ArmMotion:
                 if servo.session == session._id:
                     if servo.off_path:
                         raise MotionStopped(
-                            f"{robot.name} was moved away from its path", "plan a new motion", code="off_path"
+                            f"{robot.name} was moved away from its path, or nothing leads on along it",
+                            "plan a new motion",
+                            code="off_path",
                         )
                     if servo.arrived:
                         break

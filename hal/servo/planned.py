@@ -57,7 +57,7 @@ class PlannedMotion(ServoMotion):
         super().__init__(smoother, envelope)
         self.arrived = False
         self.lost = False
-        """Whether the arm was moved too far off the path to continue."""
+        """Whether the arm cannot continue: it was moved too far off the path, or there is no plan from where it is."""
         self._planner = ZonePlanner()
         self._sections: list[tuple[JointPath, list[Zone]]] = []
         self._before: list[float] = []
@@ -152,8 +152,11 @@ class PlannedMotion(ServoMotion):
         elif not smoother.at_rest():
             smoother.stop()
         elif self._returns():
-            self._begin_leg(0.0)
-            self._follow_leg()
+            if self._begin_leg(0.0):
+                self._follow_leg()
+            else:  # never seen; the next tick would find none either
+                self.lost = True
+                smoother.stop()
 
     def brake(self) -> bool:
         """Advance a stop on the path by one tick; False, and nothing has moved, if the arm is not moving along it."""
@@ -197,12 +200,13 @@ class PlannedMotion(ServoMotion):
             self._waits = round(RETRY / smoother.dt)
         self._leg, self._at = None, ()
 
-    def _begin_leg(self, speed: float) -> None:
-        """Plan from the present place, at ``speed`` (v) and no acceleration, to the end of the zone."""
+    def _begin_leg(self, speed: float) -> bool:
+        """Plan from the present place, at ``speed`` (v) without acceleration, to the zone's end; False if it cannot."""
         zone = self._sections[self._section][1][self._zone]
         self._leg = self._planner.through(zone, self._s, speed, self._share)
         self._t = 0.0
         self._stopping = False
+        return self._leg is not None
 
     def _begin_stop(self) -> None:
         """Replace the plan by a stop; where the zone is too short for one, it goes on in the next."""

@@ -64,7 +64,7 @@ class ServoReport:
     held_back: Limited = Limited.NONE
     """Limits by which the servo reduced the motion of the session, since it was opened."""
     off_path: bool = False
-    """Whether the arm was moved too far off the path of its session to continue."""
+    """Whether the arm cannot continue on the path of its session: it was moved too far off, or no plan leads on."""
     t_trip: float = 0.0
     """Time at which the stop was latched, s."""
     t_stop: float = 0.0

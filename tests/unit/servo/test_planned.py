@@ -16,7 +16,7 @@ from hal.errors import CommandError
 from hal.geometry import after_rotation, difference
 from hal.kinematics.arm import Kinematics
 from hal.motion.planning import PathPlanner
-from hal.servo.path import JointPath
+from hal.servo.path import JointPath, ZonePlanner
 from hal.specs import WorkspaceSpec
 from hal.types import Limited, RobotStatus, Trip
 
@@ -128,6 +128,19 @@ def test_an_arm_beside_its_path_comes_back_to_it_and_one_far_away_does_not() -> 
     assert bench.servo.report.off_path
     assert bench.servo.report.progress == progress > 0.0
     assert not bench.moving
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+def test_a_motion_without_a_plan_ends(seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_of()
+    bench.begin()
+    bench.run(seconds)
+    monkeypatch.setattr(ZonePlanner, "through", lambda *_: None)
+    bench.run(2.0)
+    assert bench.servo.report.off_path
+    assert bench.servo.report.progress < 1.0
+    assert not bench.moving
+    bench.assert_within_limits()
 
 
 def test_sections_follow_each_other_with_a_rest_in_between() -> None:
