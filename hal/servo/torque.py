@@ -107,6 +107,7 @@ class TorqueMotion(ServoMotion):
     def open(self) -> None:
         """Open a session, at rest."""
         self.margin_share = 1.0
+        self._weighed_at = None  # a session of another kind needs the inertia in another form
         if self.bounds is not None:
             self.bounds.open_session(self.smoother.q)
 

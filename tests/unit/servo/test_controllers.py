@@ -12,7 +12,7 @@ import pytest
 from errors_kit import raises_code
 from numpy.typing import NDArray
 from specs import panda
-from torque_kit import NOTHING, Driven, N, wheels
+from torque_kit import NOTHING, Driven, N, one, wheels
 
 from hal.commands import Kind, Session
 from hal.dynamics import Dynamics
@@ -325,6 +325,19 @@ def test_the_jerk_of_a_set_point_is_what_torques_can_follow() -> None:
     assert not arm.servo.active
     arm.servo.open_session(Session(2, 0.3, 0.25, True), arm.inbox())
     assert arm.servo.smoother.jerk == pytest.approx(SPEC.limits.jerk, rel=1e-4)
+
+
+def test_bare_torques_may_follow_a_controller_where_the_arm_stands() -> None:
+    arm = compliant(OperationalSpace())
+    here = arm.q.tolist()
+    arm.tamper = lambda reading: reading._replace(q=here, dq=NOTHING)
+    arm.servo.close_session()
+    arm.run(1.0)
+    assert not arm.servo.active
+    arm.servo.open_session(Session(1, 0.3, 0.25, False), arm.inbox())
+    arm.drive(0.1, one(6, 0.5))
+    assert arm.by_torques
+    assert arm.tau[6] == pytest.approx(0.5)
 
 
 @CONTROLLERS
