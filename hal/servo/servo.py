@@ -468,7 +468,9 @@ class Servo:
         if motion is not None:
             if self._anchoring.waiting:
                 self._anchoring.waiting = False  # the next one may be computed ahead, before the device is heard
-            elif motion is not self._whole or not compliance.held_back:
+            elif motion is self._whole and compliance.held_back:
+                smoother.stop()  # it may still have the speed of an arm that was pushed on
+            else:
                 motion.step(now)
             self._envelope.note(smoother)
             if self._whole is not None:

@@ -25,6 +25,7 @@ from hal.servo.controllers import (
     ControllerLaw,
     JointImpedance,
     OperationalSpace,
+    controller_data,
     resolve,
     with_gains,
 )
@@ -325,6 +326,28 @@ def test_the_jerk_of_a_set_point_is_what_torques_can_follow() -> None:
     assert not arm.servo.active
     arm.servo.open_session(Session(2, 0.3, 0.25, True), arm.inbox())
     assert arm.servo.smoother.jerk == pytest.approx(SPEC.limits.jerk, rel=1e-4)
+
+
+def test_a_motion_that_is_held_back_does_not_keep_the_speed_of_a_pushed_arm() -> None:
+    arm = compliant(JointImpedance(stiffness=100.0))
+    chosen = controller_data(arm.servo._compliance._law.controller)
+    arm.servo.close_session()
+    arm.run(0.5)
+    assert not arm.servo.active
+    goal = tuple(arm.q + [0.5, *NOTHING[1:]])
+    arm.servo.open_session(Session(2, 0.3, 0.25, False, goal, controller=chosen), arm.inbox())
+    arm.run(0.3)
+    here = arm.q.tolist()
+    arm.tamper = lambda reading: reading._replace(q=here, dq=[0.1, *NOTHING[1:]])
+    while not arm.servo.report.limited & Limited.LEAD:
+        arm.tick()
+    assert arm.servo.report.dq_set[0] > 0.05
+    there = [here[0] + 0.005, *here[1:]]  # pushed on, but not so far that the motion continues
+    arm.tamper = lambda reading: reading._replace(q=there, dq=NOTHING)
+    arm.run(0.2)
+    assert not any(arm.servo.report.dq_set)
+    away = difference(KINEMATICS.fk(there), KINEMATICS.fk(arm.servo.report.q_set))
+    assert 0.04 < math.hypot(*away[:3]) < 0.051
 
 
 def test_bare_torques_may_follow_a_controller_where_the_arm_stands() -> None:
