@@ -13,6 +13,7 @@ from contextlib import suppress
 from math import hypot
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..commands import Session
 from ..dynamics import Dynamics
@@ -25,7 +26,7 @@ from .envelope import Envelope
 from .torque import TorqueMotion
 from .torque_bounds import RATE, Inertia
 
-__all__ = ["LEAD", "Compliance"]
+__all__ = ["LEAD", "Compliance", "followable_jerk"]
 
 Floats = Sequence[float]
 
@@ -45,6 +46,11 @@ SPEED_SHARE, TCP_SHARE = 0.8, 0.85
 JERK_SHARE = 0.5
 """Share of the greatest rate of a torque that a set-point's jerk may need. With more, an arm lags behind each change of
 acceleration, and catches up as slowly as its springs are."""
+
+
+def followable_jerk(mass: NDArray[np.float64]) -> list[float]:
+    """Return the greatest jerks (n,), rad/s3, of a set-point that torques follow at an inertia (n, n), kg m2."""
+    return [JERK_SHARE * RATE / heavy for heavy in mass.diagonal().tolist()]
 
 
 class Compliance:
@@ -69,6 +75,8 @@ class Compliance:
             self._friction = self._dynamics.damping
         self._law: ControllerLaw | None = None
         """The law of this session; None if the arm's own position controller follows the set-point."""
+        self._jerk: Floats | None = None
+        """Jerks (n,) that the torques of this session can follow, rad/s3."""
         self.active = False
         """Whether the controller drives the arm."""
         self._due: tuple[Floats, Floats] = ((), ())
@@ -95,7 +103,7 @@ class Compliance:
         controller = controller_of(session.controller)
         torque, bounds = self._torque, self._torque.bounds
         self.active = self.held_back = False
-        self._law = None
+        self._law = self._jerk = None
         torque.by_controller = not isinstance(controller, Position) and bounds is not None
         smoother = torque.smoother
         smoother.limit_jerk()
@@ -104,8 +112,8 @@ class Compliance:
             torque.open()
             return
         if self._dynamics is not None:
-            heavy = self._dynamics.mass_matrix(smoother.q).diagonal().tolist()
-            smoother.limit_jerk([JERK_SHARE * RATE / mass for mass in heavy])
+            self._jerk = followable_jerk(self._dynamics.mass_matrix(smoother.q))
+            smoother.limit_jerk(self._jerk)
         self._law = ControllerLaw(
             controller, smoother.n, smoother.dt, smoother.velocity, self._dynamics, self._friction
         )
@@ -123,7 +131,13 @@ class Compliance:
     def begin(self) -> None:
         """Begin to drive the arm, whose set-point is at rest."""
         self._torque.start()
+        self._torque.smoother.limit_jerk(self._jerk)
         self.active, self.held_back = True, False
+
+    def end(self) -> None:
+        """End to drive the arm: positions hold it, or stop it as hard as the arm itself can."""
+        self.active = False
+        self._torque.smoother.limit_jerk()
 
     def hold_back(self) -> bool:
         """Bring a set-point that is too far ahead of the arm back to :data:`LEAD`; returns whether it was.

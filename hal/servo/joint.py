@@ -136,8 +136,10 @@ class JointTargetMotion(ServoMotion):
         """Whether the target stood still before the newest command."""
         self._inside = True
         """Whether the target is inside the position limits, now and until the deadline."""
-        self._stream_braking = _braking(smoother, *_STREAM)
-        self._direct_braking = _braking(smoother, *_DIRECT)
+        self._jerk: Floats = ()
+        """Jerk limits (n,), rad/s3, of which these are made; a controller has others."""
+        self._stream_braking: list[tuple[float, float, float, float]] = []
+        self._direct_braking: list[tuple[float, float, float, float]] = []
 
     def start(self) -> None:
         super().start()
@@ -180,6 +182,10 @@ class JointTargetMotion(ServoMotion):
     def _approach(self, q: list[float], dq: list[float], age: float) -> list[float]:
         """Return the target's speed (n,) ``age`` s on, plus what closes the error and still brakes in time, rad/s."""
         smoother = self.smoother
+        if self._jerk is not smoother.jerk:
+            self._jerk = smoother.jerk
+            self._stream_braking = _braking(smoother, *_STREAM)
+            self._direct_braking = _braking(smoother, *_DIRECT)
         braking = self._direct_braking if self._direct else self._stream_braking
         ahead = 2.0 * smoother.dt
         twice_ahead = ahead + ahead

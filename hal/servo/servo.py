@@ -530,7 +530,7 @@ class Servo:
     def _leave_torques(self) -> None:
         """Hand the arm over from torques to positions."""
         self._torque.leave()
-        self._compliance.active = False
+        self._compliance.end()
         self._anchoring.forget()
 
     def _finished(self) -> bool:

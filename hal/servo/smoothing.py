@@ -210,7 +210,10 @@ class JointSmoother:
         self.limit_jerk()
 
     def limit_jerk(self, most: Floats | None = None) -> None:
-        """Limit the joints' jerk to the arm's limits, and to ``most`` (n,), rad/s3, if given; to be called at rest."""
+        """Limit the joints' jerk to the arm's limits, and to ``most`` (n,), rad/s3, if given.
+
+        To be lowered at rest only: a stop that is under way would become longer.
+        """
         self.jerk = self._jerk if most is None else [min(x, y) for x, y in zip(self._jerk, most, strict=True)]
         # No stop from within the limits is longer than the one from full speed at full acceleration.
         room = [

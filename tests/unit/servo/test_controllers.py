@@ -350,6 +350,27 @@ def test_a_motion_that_is_held_back_does_not_keep_the_speed_of_a_pushed_arm() ->
     assert 0.04 < math.hypot(*away[:3]) < 0.051
 
 
+def test_a_pushed_arm_is_stopped_by_positions_at_once_and_as_hard_as_the_arm_can() -> None:
+    arm = compliant(JointImpedance())
+    assert arm.servo.smoother.jerk[0] < 0.5 * SPEC.limits.jerk[0]
+    compliance = arm.servo._compliance
+    strays, compliance.strays = compliance.strays, lambda: Limited.COLLISION
+    arm.tick()
+    compliance.strays = strays
+    assert not arm.by_torques
+    assert arm.state == (RobotStatus.TRIPPED, Trip.LIMIT)
+    assert arm.servo.report.dq_set[0] > 0.05
+    assert arm.servo.smoother.jerk == pytest.approx(SPEC.limits.jerk, rel=1e-4)
+    arm.run(0.3)
+    assert not any(arm.servo.report.dq_set)
+    arm.press_again()
+    for _ in range(3):
+        arm.send([0.2] + [0.0] * 6, Kind.JOINT_VELOCITY)
+        arm.tick()
+    assert arm.by_torques
+    assert arm.servo.smoother.jerk[0] < 0.5 * SPEC.limits.jerk[0]
+
+
 def test_bare_torques_may_follow_a_controller_where_the_arm_stands() -> None:
     arm = compliant(OperationalSpace())
     here = arm.q.tolist()

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from servo_kit import Bench, N
+from servo_kit import Bench, N, tightened
 from specs import PANDA_HOME, panda
 
 import hal
@@ -402,3 +402,17 @@ def test_a_full_chunk_travels_whole_to_the_servos_process() -> None:
             due = np.interp(state.stamp.t, times, points[:, 0])
             assert state.q[0] == pytest.approx(due, abs=5e-3)
             assert state.q[0] > home[0] + 0.05
+
+
+def test_a_stream_brakes_with_the_jerk_that_is_allowed_at_present() -> None:
+    soft = Bench(replace(panda(), limits=tightened(panda().limits, 1.0, 0.01)))
+    lowered = Bench()
+    for bench in (soft, lowered):
+        for k in range(60):
+            if k == 10:
+                bench.servo.smoother.limit_jerk(soft.servo.smoother.jerk)
+            ahead = 0.0 if k < 10 else min(1.5, 0.08 * (k - 10))
+            bench.send(Kind.JOINT_TARGET, [PANDA_HOME[0] + ahead + 1e-12 * k, *PANDA_HOME[1:], *[0.0] * N])
+            bench.run(0.05)
+    assert lowered.q[0] > PANDA_HOME[0] + 1.4
+    assert np.array(lowered.history) == pytest.approx(np.array(soft.history), abs=1e-6)
