@@ -1,0 +1,63 @@
+"""Where the guard of an arm takes the arms of other processes to be, and where they end if they stop."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from specs import panda
+
+from hal.commands import NO_INBOX, Session
+from hal.dynamics import Dynamics
+from hal.host.guards import ArmElsewhere
+from hal.host.records import ServoRecord
+from hal.servo.controllers import JointImpedance, controller_data, resolve
+from hal.servo.servo import Servo
+from hal.servo.smoothing import stop_distance
+from hal.types import ControlMode, Limited, RobotStatus, Trip
+
+SPEC = panda()
+SET = np.array(SPEC.home)
+MEASURED = SET - 0.01
+SPEED = np.array([0.4, -0.3, 0.0, 0.2, 0.5, -0.4, 0.3])
+
+
+def elsewhere(status: RobotStatus, controller: ControlMode) -> tuple[Any, Any]:
+    """Return what is taken of an arm whose set-point moves at ``SPEED``."""
+    record = ServoRecord(
+        status, Trip.NONE, Limited.NONE, 1, 1, False, 0, 0.0, 0.0, SET.tolist(), SPEED.tolist(), controller
+    )
+    mail: Any = SimpleNamespace(peek=lambda: record, get_state=lambda: SimpleNamespace(q=MEASURED))
+    q, end = ArmElsewhere(SPEC, mail)()
+    return np.array(q), np.array(end)
+
+
+def stop(jerk: Any) -> Any:
+    limits = zip(SPEED, SPEC.limits.acceleration, jerk, strict=True)
+    return SET + [np.copysign(stop_distance(abs(v), A, J), v) for v, A, J in limits]
+
+
+def test_an_arm_that_follows_positions_is_at_its_set_point() -> None:
+    q, end = elsewhere(RobotStatus.FOLLOWING, ControlMode.POSITION)
+    assert np.array_equal(q, SET)
+    assert end == pytest.approx(stop(SPEC.limits.jerk) + 0.004 * SPEED)
+
+
+@pytest.mark.parametrize("at", [SET, SET + [0.0, 1.2, 0.0, 0.8, 0.0, 0.0, 0.0]])  # the second one: stretched out
+def test_an_arm_with_a_controller_is_where_it_is_measured_and_stops_as_softly_as_its_set_point(at: Any) -> None:
+    q, end = elsewhere(RobotStatus.FOLLOWING, ControlMode.JOINT_IMPEDANCE)
+    assert np.array_equal(q, MEASURED)
+    servo = Servo(SPEC, 1e-3, mass_matrix=Dynamics.of(SPEC).mass_matrix)
+    servo.anchor(at.tolist())
+    controller = resolve(JointImpedance(), SPEC, servo.kinematics, 1000.0)
+    servo.open_session(Session(1, 0.3, 0.25, False, controller=controller_data(controller)), NO_INBOX)
+    soft = stop(servo.smoother.jerk) - SET
+    assert (np.abs(soft) > 2.0 * np.abs(stop(SPEC.limits.jerk) - SET)).any()
+    assert (np.abs(end - SET) >= np.abs(soft) - 1e-6).all()
+
+
+def test_an_arm_that_may_be_moved_by_hand_is_where_it_is_measured() -> None:
+    for got in elsewhere(RobotStatus.IDLE, ControlMode.POSITION):
+        assert np.array_equal(got, MEASURED)
