@@ -216,6 +216,7 @@ class TestRecordedRealSense(CameraContract, left_out=FILE):
             yield bench
 
 
+@pytest.mark.slow
 class TestRecordedRealSenseOnDemand(CameraContract, left_out=FILE):
     @pytest.fixture
     def bench(self, recorded: str) -> Iterator[CameraBench]:

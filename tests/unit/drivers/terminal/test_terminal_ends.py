@@ -44,11 +44,17 @@ def program(far: FarEnd, folder: Path, ending: str = "") -> InTerminal:
 
 
 SIGTERM, SIGKILL = (f"os.kill(os.getpid(), signal.{name})" for name in ("SIGTERM", "SIGKILL"))
-CRASHES = ["raise RuntimeError('a mistake')", "sys.exit(3)", "os._exit(4)", "os.abort()", SIGTERM]
+CRASHES = ["raise RuntimeError('a mistake')", "os.abort()"]
+MORE_CRASHES = ["sys.exit(3)", "os._exit(4)", SIGTERM]
 
 
 @pytest.mark.parametrize(
-    ("ending", "kitty"), [*((ending, True) for ending in CRASHES), *product(["pad.close()", SIGKILL], [False, True])]
+    ("ending", "kitty"),
+    [
+        *((ending, True) for ending in CRASHES),
+        *(pytest.param(ending, True, marks=pytest.mark.slow) for ending in MORE_CRASHES),
+        *product(["pad.close()", SIGKILL], [False, True]),
+    ],
 )
 def test_terminal_is_restored_when_the_program_ends(tmp_path: Path, ending: str, kitty: bool) -> None:
     with FarEnd(kitty=kitty) as far, program(far, tmp_path, f"{ending}; sys.exit()") as it:
