@@ -15,6 +15,7 @@ from .types import Frame, GripperState, RobotState
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from .gripper import Gripper
     from .rig import Rig
 
 __all__ = ["Moment", "Observation", "Observer"]
@@ -24,6 +25,8 @@ _FRESH = 0.2
 """Age from which a frame is too old, so that the next one is waited for, s."""
 _NEXT = 0.02
 """Longest wait for a state that is as new as the newest frame, s."""
+_LATE = 0.2
+"""Longest wait for a gripper's state, after the time that it is for, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,6 +145,16 @@ class Observer:
             if robot.gripper is not None:
                 grip = robot.gripper.newest()
                 if grip is None or grip.stamp.t != t:
-                    grip = robot.gripper.state_at(t)
+                    grip = self._gripper_at(robot.gripper, t)
                 grippers[robot.name] = grip
         return MappingProxyType(robots), MappingProxyType(grippers)
+
+    def _gripper_at(self, gripper: Gripper, t: float) -> GripperState:
+        """Return a gripper's state at ``t``; one that is late, as those of a slow process may be, is waited for."""
+        while True:
+            try:
+                return gripper.state_at(t)
+            except StaleStateError:
+                if self._rig.lock_step or self._rig.clock.now() > t + _LATE:
+                    raise
+            self._rig.clock.sleep(0.002)

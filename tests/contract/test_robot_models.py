@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 from engines_kit import Engine
 
+import hal
 from hal import registry
 from hal.config import load
 from hal.config.data_files import list_data
 from hal.errors import ConfigError
+from hal.skills import grasp, grasp_pose, locate_by_truth
 from hal.testing import RobotBench, RobotContract
 
 from .benches import _robot_bench
@@ -70,3 +72,20 @@ class TestModelsWithoutTorques(
 class TestSlowModels(RobotContract):
     bench = bench_of(*SLOW)
     test_set_points_are_followed = None  # type: ignore[assignment]  # its motion is too fast
+
+
+def test_fingers_that_come_forward_grasp_a_low_object_with_more_clearance() -> None:
+    box = {"name": "box", "shape": "box", "half_extents": [0.015, 0.015, 0.02], "mass": 0.1, "position": [0.5, 0, 0.0]}
+    config = {"sim": True, "robots": {"arm": {"model": "ur5e"}}, "objects": ["floor", box]}
+    try:
+        rig = hal.open(config, clock="lock_step")
+    except ConfigError as error:
+        if all(problem.code == "missing_package" for problem in error.problems):
+            pytest.skip(error.problems[0].message)
+        raise
+    with rig:
+        arm = rig.robots["arm"]
+        assert arm.gripper is not None
+        found = locate_by_truth(rig, arm, "box")
+        result = grasp(arm, grasp_pose(found, arm.gripper, clearance=0.03), width=found.width, speed=0.5)
+        assert result, result.message

@@ -7,6 +7,7 @@ import pytest
 import hal
 from hal.drivers.mock.camera import read_picture
 from hal.errors import CommandError, DeviceNotFound, StaleStateError
+from hal.types import GripperState
 
 
 def test_pictures_and_states_of_the_same_time_in_real_time() -> None:
@@ -84,8 +85,23 @@ def test_a_camera_without_new_frames_is_an_error() -> None:
             rig.observe(after=rig.clock.now(), timeout=0.3)
 
 
-def test_without_cameras_it_waits_for_a_new_state() -> None:
+def test_without_cameras_it_waits_for_a_new_state(monkeypatch: pytest.MonkeyPatch) -> None:
     with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=["cameras={}"]) as rig:
         for _ in range(20):
             now = rig.clock.now()
             assert rig.observe(after=now).robots["panda"].stamp.t >= now
+        gripper = rig.robots["panda"].gripper
+        calls: list[float] = []
+        assert gripper is not None
+        state_at = gripper.state_at
+
+        def late(t: float) -> GripperState:
+            calls.append(t)
+            if len(calls) == 1:
+                raise StaleStateError("late")
+            return state_at(rig.clock.now())
+
+        monkeypatch.setattr(type(gripper), "newest", lambda _: None)
+        monkeypatch.setattr(type(gripper), "state_at", lambda _, t: late(t))
+        assert rig.observe().grippers["panda"].width > 0.0
+        assert len(calls) > 1, "a late gripper is waited for, too"
