@@ -406,7 +406,7 @@ def show_rest(name: str, found: Rest) -> None:
     worst, median = np.max(found.errors, axis=0), np.median(found.errors, axis=0)
     print(
         f"rest    {name:22s} {len(found.goals)} reached; at most {1e3 * worst[0]:.3f} mm and {worst[1]:.5f} rad, "
-        f"median {1e3 * median[0]:.3f} mm and {median[1]:.5f} rad"
+        f"median {1e3 * median[0]:.3f} mm and {median[1]:.5f} rad; {_over(found.errors)} beyond the goal"
     )
     for text in found.missed:
         print(f"        {text}")
@@ -418,12 +418,15 @@ def show_friction(arm: hal.Robot, controller: Any, found: Rest) -> None:
 
     left = np.array([left_by_friction(arm, controller, goal, COULOMB) for goal in found.goals])
     (most, turn), (median, turn_median) = left.max(axis=0), np.median(left, axis=0)
-    over = (left > (1e-3, 5e-3)).any(axis=1).sum()
     print(
         f"        friction may leave at most {1e3 * most:.3f} mm and {turn:.5f} rad, median {1e3 * median:.3f} mm and "
-        f"{turn_median:.5f} rad, and more than 1 mm or 0.005 rad at {over} goals; it left at most "
-        f"{(found.errors / left).max():.2f} of that"
+        f"{turn_median:.5f} rad, {_over(left)} beyond the goal; {(found.errors / left).max():.2f} of it is left at most"
     )
+
+
+def _over(distances: Any) -> int:
+    """Return how many of some distances (n, 2), m and rad, are beyond 1 mm or 0.005 rad."""
+    return int((distances > (1e-3, 5e-3)).any(axis=1).sum())
 
 
 def show_tour(name: str, found: tuple[float, float, int]) -> None:
