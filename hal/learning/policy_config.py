@@ -43,6 +43,8 @@ STATES = ("q", "dq", "tcp_position", "tcp_quaternion", "tcp_rpy", "tcp_rotvec", 
 _OF_GRIPPER = STATES[-3:]
 _SUMMED = ("joint_velocity", "tcp_delta")
 """Kinds of actions that are steps from one target to the next."""
+_FOLLOWED = 0.9
+"""Share of the rig's speeds that steps may use up: an arm that starts to move later can catch up."""
 
 
 def _known_state(name: str) -> str:
@@ -168,8 +170,8 @@ class ActionConfig(Strict):
         """Return how many numbers move an arm with so many joints."""
         return (6 if self.kind == "tcp_delta" else joints) + (self.gripper is not None)
 
-    def decode(self, actions: Array, observation: Observation, robot: Robot) -> Decoded:
-        """Return the targets of the rows (k, numbers) of one arm, which answer ``observation``.
+    def decode(self, actions: Array, observation: Observation, robot: Robot, period: float) -> Decoded:
+        """Return the targets of the rows (k, numbers) of one arm, which answer ``observation``, ``period`` s apart.
 
         Raises:
             PolicyError: A pose of the tcp is out of reach (code ``policy_unreachable_pose``).
@@ -182,8 +184,10 @@ class ActionConfig(Strict):
         if self.clip:
             actions = actions / np.maximum(1.0, np.abs(actions).max(axis=1, keepdims=True))
         if self.kind == "tcp_delta":
-            return Decoded(self._follow_steps(actions, state.tcp, state.q, robot), grip)
-        q = self.scale * (np.cumsum(actions, axis=0) if self.kind in _SUMMED else actions)
+            return Decoded(self._follow_steps(actions, state.tcp, state.q, robot, period), grip)
+        if self.kind == "joint_velocity":
+            return Decoded(self._add_steps(actions, state.q, robot, period), grip)
+        q = self.scale * actions
         return Decoded(q if self.kind == "joint_position" else state.q + q, grip)
 
     def encode(self, targets: Decoded, observation: Observation, robot: Robot) -> Array:
@@ -202,20 +206,49 @@ class ActionConfig(Strict):
         values = self.gripper.values(targets.grip, robot.gripper.width_max)
         return np.insert(rows, self.gripper.index % (rows.shape[1] + 1), values, axis=1)
 
-    def _follow_steps(self, actions: Array, tcp: Pose, q: Array, robot: Robot) -> Array:
+    def _add_steps(self, actions: Array, q: Array, robot: Robot, period: float) -> Array:
+        """Return the joint positions (k, n) of steps (k, n), which begin at ``q``."""
+        found = []
+        for step in self.scale * actions:
+            q = q + _possible_share(robot, q, q + step, period) * step
+            found.append(q)
+        return np.array(found)
+
+    def _follow_steps(self, actions: Array, tcp: Pose, q: Array, robot: Robot, period: float) -> Array:
         """Return the joint positions (k, n) of steps (k, 6) of the tcp, which begin at ``tcp`` and ``q``."""
-        found, position, orientation = [], np.array(tcp.position), tcp.orientation.tolist()
-        for step in actions:
-            position = position + self.scale * step[:3]
-            orientation = after_rotation(orientation, (self.turn * step[3:]).tolist())
+        found, pose = [], tcp
+        for action in actions:
+            step = np.concatenate([self.scale * action[:3], self.turn * action[3:]])
             try:
-                q = robot.ik(Pose(position, orientation), q)
+                after = _moved(pose, step)
+                goal = robot.ik(after, q)
+                if (share := _possible_share(robot, q, goal, period)) < 1.0:
+                    after = _moved(pose, share * step)
+                    goal = robot.ik(after, q)
             except Unreachable as error:
                 raise PolicyError(
                     f"the policy leads out of the arm's reach: {error}", code="policy_unreachable_pose"
                 ) from error
+            q, pose = goal, after
             found.append(q)
         return np.array(found)
+
+
+def _moved(pose: Pose, step: Array) -> Pose:
+    """Return a pose after a step (6,): a translation, m, and a rotation vector, rad, along the base's axes."""
+    return Pose(pose.position + step[:3], after_rotation(pose.orientation.tolist(), step[3:].tolist()))
+
+
+def _possible_share(robot: Robot, q: Array, goal: Array, period: float) -> float:
+    """Return the share of a step between joint positions that an arm covers in ``period`` s, at the rig's speeds.
+
+    A policy that commands speeds, as DROID's, counts on an arm that moves more slowly where it cannot follow. Targets
+    farther away would only leave it ever farther behind, so that the next chunk would seem to jump.
+    """
+    spec = robot.spec
+    joints = np.abs(goal - q) / (spec.speed * np.asarray(spec.limits.velocity))
+    tcp = robot.fk(goal).distance(robot.fk(q))[0] / spec.tcp_speed
+    return float(min(1.0, _FOLLOWED * period / max(joints.max(), tcp, 1e-9)))
 
 
 class PolicyConfig(Strict):
@@ -348,7 +381,7 @@ class PolicyConfig(Strict):
         for action in self.actions:
             name = action.robot or next(iter(robots))
             rows = actions if action.columns is None else actions[:, slice(*action.columns)]
-            found[name] = action.decode(rows, observation, robots[name])
+            found[name] = action.decode(rows, observation, robots[name], 1.0 / self.rate_hz)
         return found
 
     def encode(self, targets: Mapping[str, Decoded], observation: Observation, robots: Mapping[str, Robot]) -> Array:

@@ -145,7 +145,7 @@ def test_pictures_are_scaled_to_fit_and_padded() -> None:
     ("action", "row", "expected"),
     [
         ({"kind": "joint_delta"}, [0.1] + 6 * [0.0], [0.1, 0.1]),
-        ({"kind": "joint_velocity", "scale": 0.2, "clip": True}, [2.0, 1.0] + 5 * [0.0], [0.2, 0.4]),
+        ({"kind": "joint_velocity", "scale": 0.01, "clip": True}, [2.0, 1.0] + 5 * [0.0], [0.01, 0.02]),
     ],
 )
 def test_relative_actions_start_from_the_observed_positions(
@@ -159,18 +159,40 @@ def test_relative_actions_start_from_the_observed_positions(
 
 
 def test_steps_of_the_tcp_become_joint_positions(rig: hal.Rig) -> None:
-    config = load_policy_config({**CONFIG, "action": {"kind": "tcp_delta", "scale": 0.01, "turn": 0.1}})
+    config = load_policy_config({**CONFIG, "action": {"kind": "tcp_delta", "scale": 0.01, "turn": 0.03}})
     arm, observation = rig.robots["panda"], rig.observe(cameras=())
     decoded = config.decode(np.tile([1.0, 0, 0, 0, 0, 1.0], (3, 1)), observation, {"panda": arm})["panda"]
     before, after = observation.robots["panda"].tcp, arm.fk(decoded.q[-1])
     np.testing.assert_allclose(after.position - before.position, [0.03, 0.0, 0.0], atol=1e-4)
-    assert abs(before.distance(after)[1] - 0.3) < 1e-3
+    assert abs(before.distance(after)[1] - 0.09) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("action", "row"),
+    [
+        ({"kind": "joint_velocity", "scale": 0.2}, [0, 0, 0, 0, 0.2, 0, 1]),
+        ({"kind": "joint_velocity", "scale": 0.2}, [1, 0, 0, 0, 0, 0, 0]),
+        ({"kind": "tcp_delta", "scale": 0.05, "turn": 0.5}, [0, 0, 1, 0, 0, 0]),
+        ({"kind": "tcp_delta", "scale": 0.05, "turn": 0.5}, [0, 0.1, 0, 0, 0, 1]),
+    ],
+)
+def test_steps_that_are_too_fast_for_the_rig_are_shortened(
+    rig: hal.Rig, action: dict[str, Any], row: list[float]
+) -> None:
+    config = load_policy_config({**CONFIG, "action": action})
+    arm, observation = rig.robots["panda"], rig.observe(cameras=())
+    q = config.decode(np.tile(row, (4, 1)), observation, {"panda": arm})["panda"].q
+    q = np.vstack([observation.robots["panda"].q, q])
+    joints = (np.abs(np.diff(q, axis=0)) / (arm.spec.speed * np.asarray(arm.limits.velocity))).max() * 15
+    tcp = np.array([arm.fk(row).position for row in q])
+    fastest = max(joints, np.linalg.norm(np.diff(tcp, axis=0), axis=1).max() * 15 / arm.spec.tcp_speed)
+    assert 0.85 < fastest < 0.95
 
 
 @pytest.mark.parametrize("kind", ["joint_position", "joint_delta", "joint_velocity"])
 def test_actions_of_a_chunk_return_from_its_targets(rig: hal.Rig, kind: str) -> None:
     gripper = {"index": 2, "open": 1.0, "closed": -1.0}
-    config = load_policy_config({**CONFIG, "action": {"kind": kind, "scale": 0.5, "gripper": gripper}})
+    config = load_policy_config({**CONFIG, "action": {"kind": kind, "scale": 0.003, "gripper": gripper}})
     actions, observation = np.random.default_rng(1).uniform(-1.0, 1.0, (6, 8)), rig.observe(cameras=())
     targets = config.decode(actions, observation, rig.robots)
     np.testing.assert_allclose(config.encode(targets, observation, rig.robots), actions, atol=1e-12)

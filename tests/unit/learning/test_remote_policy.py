@@ -388,6 +388,18 @@ def test_a_bad_answer_later_ends_the_episode_at_rest(rig: Rig, infer: Any, code:
     assert_within_limits(rig)
 
 
+def test_a_policy_that_is_faster_than_the_rig_allows_is_followed_at_the_rigs_speed(rig: Rig) -> None:
+    """It used to leave the arm behind, until the next chunk, which begins where the arm is, seemed to jump."""
+    action = {"kind": "joint_velocity", "scale": 0.2, "gripper": {"index": 7}}
+    row = np.array([0.5, 0, 0, 0, 0, 0, 0, 0])
+    outcome = run(
+        rig, lambda request: {"actions": np.tile(row, (16, 1))}, config={**CONFIG, "action": action}, seconds=2.0
+    )
+    assert (outcome.ended, outcome.statistics["steep"]) == ("time", 0)
+    assert rig.robots["panda"].state().q_set[0] > 0.5
+    assert_within_limits(rig)
+
+
 def test_a_first_target_far_away_is_refused(rig: Rig) -> None:
     outcome = run(rig, far_away)
     assert outcome.ended == "error"
