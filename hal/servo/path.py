@@ -6,10 +6,11 @@ derivatives by s written q', q'' and q''', a joint moves at
 
     dq = q' v,    ddq = q' a + q'' v^2,    dddq = q' j + 3 q'' v a + q''' v^3.
 
-Between two knots each of q', q'' and q''' has a bound, from which :func:`zones_of` computes limits of v, a and j that
-together keep every limit of every joint, and the speed of the tcp. Neighbours with similar limits make up a
-:class:`Zone`: there Ruckig plans v with constant limits, from one zone's border to the next, where a is 0. So wherever
-the arm stops on the path, a plan from there is a matter of microseconds.
+Between two knots each of q', q'' and q''' has bounds, from which :func:`zones_of` computes limits of v, a and j that
+together keep every limit of every joint, and the speed of the tcp. Speeding up and slowing down have limits of their
+own: where a joint gets faster although v does not, as on the way into a singularity, only slowing down helps it.
+Neighbours with similar limits make up a :class:`Zone`: there Ruckig plans v with constant limits, from one zone's
+border to the next, where a is 0. So wherever the arm stops on the path, a plan from there is a matter of microseconds.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ __all__ = ["JointPath", "Leg", "Zone", "ZonePlanner", "zones_of"]
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 
-_CURVE_ACCELERATION = (0.3, 0.5, 0.7)
-"""Shares of the acceleration that q'' v^2 may use; the rest is for q' a. The one with the shortest time is taken."""
+_CURVE_ACCELERATION = 0.8
+"""Greatest share of the acceleration that q'' v^2 may use; the rest is left to stop there, and to start again."""
 
 _CURVE_JERK = 0.3
 """Share of the jerk limit that q''' v^3 may use."""
@@ -41,11 +42,8 @@ _CURVE_JERK = 0.3
 _MIXED_JERK = 0.3
 """Share of the jerk limit that 3 q'' v a may use."""
 
-_ROUNDS = 4
-"""Rounds in which the limits of v and a are adapted to each other."""
-
-_ALIKE = (1.05, 1.2, 2.0)
-"""Greatest ratios of the limits of v, a and j within a zone."""
+_ALIKE = (1.05, 1.2, 1.2, 2.0)
+"""Greatest ratios of the limits of v, a (speeding up and slowing down) and j within a zone."""
 
 _TINY = 1e-12
 
@@ -91,16 +89,16 @@ class JointPath:
         return np.concatenate((np.swapaxes(between, 0, 1).reshape(-1, self.q.shape[1]), self.q[-1:]))
 
     def bounds(self) -> tuple[Array, Array, Array]:
-        """Return bounds (k - 1, n) of the sizes of q', q'' and q''' between two knots.
+        """Return bounds between two knots: of q' and -q' (2, k - 1, n), of q'' and -q'', and of |q'''| (k - 1, n).
 
         q' is a parabola there, which is in the hull of its three control points; q'' is a line.
         """
         h = np.diff(self.s)[:, None]
         _, b, c, d = np.moveaxis(self._coefficients, -1, 0)
-        end = b + h * (2.0 * c + 3.0 * h * d)
-        first = np.maximum(np.maximum(np.abs(b), np.abs(b + h * c)), np.abs(end))
-        second = np.maximum(np.abs(2.0 * c), np.abs(2.0 * c + 6.0 * h * d))
-        return first, second, np.abs(6.0 * d)
+        first = np.stack((b, b + h * c, b + h * (2.0 * c + 3.0 * h * d)))
+        second = np.stack((2.0 * c, 2.0 * c + 6.0 * h * d))
+        rates, curves = (np.stack((x.max(axis=0), -x.min(axis=0))) for x in (first, second))
+        return rates, curves, np.abs(6.0 * d)
 
     def nearest(self, q: Floats, s: float) -> float:
         """Return the parameter near ``s`` at which the path is nearest to ``q`` (n,), rad (Newton's method)."""
@@ -142,6 +140,9 @@ class Zone(NamedTuple):
     speed: float
     """Greatest v, 1/s in units of s; the same unit for the others."""
     acceleration: float
+    """Greatest a."""
+    braking: float
+    """Greatest -a."""
     jerk: float
     leave: float
     """Greatest v at the end from which the rest of the section can be passed within its limits."""
@@ -157,51 +158,60 @@ def zones_of(path: JointPath, limits: LimitsSpec, velocity: Floats, tcp_speed: f
         tcp_speed: Greatest speed of the tcp, m/s; infinite for none.
         arm: The arm's kinematics.
     """
-    first, second, third = (np.maximum(bound, _TINY) for bound in path.bounds())
+    rates, curves, third = (np.maximum(bound, _TINY) for bound in path.bounds())
+    first, second = rates.max(axis=0), curves.max(axis=0)
     A, J = np.array(limits.acceleration), np.array(limits.jerk)
-    most = np.minimum((np.asarray(velocity) / first).min(axis=1), np.cbrt(_CURVE_JERK * J / third).min(axis=1))
+    bends = np.sqrt(_CURVE_ACCELERATION * A / second)
+    most = np.minimum(np.minimum(np.asarray(velocity) / first, np.cbrt(_CURVE_JERK * J / third)), bends).min(axis=1)
     if tcp_speed < np.inf:
         most = np.minimum(most, tcp_speed / np.maximum(_tcp_rates(path, arm), _TINY))
-    curve = np.sqrt(A / second).min(axis=1)
-    widths = np.diff(path.s)
-    shortest, v, a = np.inf, most, most
-    for share in _CURVE_ACCELERATION:
-        speed = np.minimum(most, sqrt(share) * curve)
-        for _ in range(_ROUNDS):
-            acceleration = ((A - second * np.square(speed)[:, None]) / first).min(axis=1)
-            mixed = (_MIXED_JERK * J / (3.0 * second * speed[:, None])).min(axis=1)
-            acceleration = np.minimum(acceleration, mixed)
-            # Where the arm cannot get as fast, less of its acceleration is taken by the curve of the path.
-            inside, duration = _fastest(speed, acceleration, widths)
-            speed = np.minimum(speed, inside)
-        if duration < shortest:
-            shortest, v, a = duration, speed, acceleration
-    j = ((J - third * (v**3)[:, None] - 3.0 * second * (v * a)[:, None]) / first).min(axis=1)
-    rows: list[list[float]] = np.stack((v, a, j), axis=1).tolist()
+    squares = _fastest(np.square(most), rates / (2.0 * np.diff(path.s)[:, None]), curves, A)
+    v = np.sqrt(squares)
+    left = A - curves * squares[:, None]
+    mixed = (_MIXED_JERK * J / (3.0 * second)).min(axis=1) / v
+    up, down = (np.minimum((left / rate).min(axis=(0, 2)), mixed) for rate in (rates, rates[::-1]))
+    used = third * (v**3)[:, None] + 3.0 * second * (v * np.maximum(up, down))[:, None]
+    j = ((J - used) / first).min(axis=1)
+    rows: list[list[float]] = np.stack((v, up, down, j), axis=1).tolist()
     parts = _merge(path.s.tolist(), rows)
     zones: list[Zone] = []
     leave = 0.0  # backwards: no faster than allows to slow down for what follows
-    for start, end, speed, acceleration, jerk in reversed(parts):
+    for start, end, (speed, acceleration, braking, jerk) in reversed(parts):
         leave = min(leave, speed)
-        zones.append(Zone(start, end, speed, acceleration, jerk, leave))
-        leave = _reachable(leave, end - start, speed, acceleration, jerk)
+        zones.append(Zone(start, end, speed, acceleration, braking, jerk, leave))
+        leave = _reachable(leave, end - start, speed, braking, jerk)
     return zones[::-1]
 
 
-def _fastest(speed: Array, acceleration: Array, widths: Array) -> tuple[Array, float]:
-    """Return the greatest v between two knots (k - 1,) from rest to rest, without a limit of jerk, and the duration."""
-    squares, rises = np.square(speed).tolist(), (2.0 * acceleration * widths).tolist()
-    forward, backward = [0.0], [0.0]
-    for square, rise in zip(squares, rises, strict=True):
-        forward.append(min(square, forward[-1] + rise))
-    for square, rise in zip(reversed(squares), reversed(rises), strict=True):
-        backward.append(min(square, backward[-1] + rise))
-    least = np.minimum(forward, backward[::-1])
-    # Between two knots it rises from both until the two lines meet.
-    inside: Array = np.sqrt(0.5 * (least[1:] + least[:-1]) + acceleration * widths)
-    knots = np.sqrt(least)
-    slowest = np.minimum(np.minimum(inside, speed), 0.5 * (knots[1:] + knots[:-1]) + _TINY)
-    return inside, float((widths / slowest).sum())
+def _fastest(most: Array, rates: Array, curves: Array, A: Array) -> Array:
+    """Return the greatest v^2 between two knots (k - 1,) from rest to rest, without a limit of jerk.
+
+    With x = v^2, a is the change of x over twice the way (as in Pham and Pham, "A New Approach to Time-Optimal Path
+    Parameterization Based on Reachability Analysis", IEEE T-RO 34(3), 2018).
+
+    Args:
+        most: Greatest x (k - 1,).
+        rates: Bounds of q' and -q' over twice the way between two knots (2, k - 1, n).
+        curves: Bounds of q'' and -q'' (2, k - 1, n).
+        A: Greatest accelerations (n,).
+    """
+    forward = _from_rest(most, rates, curves, A)
+    backward = _from_rest(most[::-1], rates[::-1, ::-1], curves[:, ::-1], A)[::-1]
+    ends = np.minimum(forward, backward)
+    # Between two knots x rises from both until the two lines meet, above their mean.
+    rates = 2.0 * rates.max(axis=0)
+    inside = ((A + rates * 0.5 * (ends[1:] + ends[:-1])[:, None]) / (rates + curves)).min(axis=(0, 2))
+    greatest: Array = np.minimum(most, np.maximum(np.maximum(ends[1:], ends[:-1]), inside))
+    return greatest
+
+
+def _from_rest(most: Array, rates: Array, curves: Array, A: Array) -> Array:
+    """Return the greatest x at knots (k,), 0 at the first: rates (y - x) + curves y <= A from each x to the next, y."""
+    free, share = A / (rates + curves), rates / (rates + curves)
+    x = [0.0]
+    for k, limit in enumerate(most.tolist()):
+        x.append(min(limit, float((free[:, k] + share[:, k] * x[k]).min())))
+    return np.array(x)
 
 
 def _tcp_rates(path: JointPath, arm: Kinematics) -> Array:
@@ -217,8 +227,8 @@ def _tcp_rates(path: JointPath, arm: Kinematics) -> Array:
     return bound
 
 
-def _merge(knots: list[float], rows: list[list[float]]) -> list[tuple[float, float, float, float, float]]:
-    """Return (start, end, v, a, j) of zones of neighbours whose limits (v, a, j) are alike."""
+def _merge(knots: list[float], rows: list[list[float]]) -> list[tuple[float, float, list[float]]]:
+    """Return start, end and limits of zones of neighbours whose limits (``rows``, see :data:`_ALIKE`) are alike."""
     parts = []
     start = 0
     least, most = list(rows[0]), list(rows[0])
@@ -226,10 +236,10 @@ def _merge(knots: list[float], rows: list[list[float]]) -> list[tuple[float, flo
         lower = [min(x, y) for x, y in zip(least, row, strict=True)]
         upper = [max(x, y) for x, y in zip(most, row, strict=True)]
         if any(y > ratio * x for x, y, ratio in zip(lower, upper, _ALIKE, strict=True)):
-            parts.append((knots[start], knots[k], least[0], least[1], least[2]))
+            parts.append((knots[start], knots[k], least))
             start, lower, upper = k, list(row), list(row)
         least, most = lower, upper
-    parts.append((knots[start], knots[-1], least[0], least[1], least[2]))
+    parts.append((knots[start], knots[-1], least))
     return parts
 
 
@@ -363,6 +373,7 @@ class ZonePlanner:
         inputs.current_position, inputs.current_velocity, inputs.current_acceleration = [0.0], [v], [a]
         inputs.target_velocity, inputs.target_acceleration = [to], [0.0]
         inputs.max_velocity, inputs.max_acceleration, inputs.max_jerk = [most], [zone.acceleration], [zone.jerk]
+        inputs.min_acceleration = [-zone.braking]
         trajectory = Trajectory(1)
         try:
             result = self._ruckig.calculate(inputs, trajectory)

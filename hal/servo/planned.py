@@ -114,7 +114,7 @@ class PlannedMotion(ServoMotion):
             tuple(smoother.jerk),
         )
         plan = [(path, zones_of(path, limits, envelope.velocity, tcp_speed, envelope.kinematics)) for path in paths]
-        if not all(zone.speed > 0.0 and zone.acceleration > 0.0 and zone.jerk > 0.0 for _, z in plan for zone in z):
+        if not all(min(zone.speed, zone.acceleration, zone.braking, zone.jerk) > 0.0 for _, z in plan for zone in z):
             raise CommandError("the path has a part that no speed is slow enough for", code="bad_path")
         self._sections = plan
         self._before = [0.0]

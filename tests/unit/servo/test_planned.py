@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from servo_kit import Bench, tightened
 from specs import PANDA_HOME, panda
 
 from hal.commands import PATH_KNOTS, PathSection
-from hal.errors import CommandError
+from hal.errors import CommandError, Unreachable
 from hal.geometry import after_rotation, difference
 from hal.kinematics.arm import Kinematics
 from hal.motion.planning import PathPlanner
@@ -106,6 +107,44 @@ def test_a_stop_is_made_on_the_line_and_the_motion_continues_on_it(cause: str) -
         away, turned = off_line(bench)
         assert away < 2e-4
         assert turned < 1e-3
+        bench.assert_within_limits()
+
+
+SINGULAR = [-2.477, -1.531, 1.802, -1.124, 1.258, 0.809, 2.27]
+BESIDE = [0.605, 0.094, 0.104, -0.4905, 0.7433, 0.3433, -0.2999]
+"""Start, rad, and goal of a line near a singularity."""
+
+
+def test_a_line_near_a_singularity_takes_little_longer_than_the_least_time() -> None:
+    sections = PLANNER.along_poses(SINGULAR, [BESIDE]).sections
+    bench = bench_of(sections, spec=replace(SPEC, home=tuple(SINGULAR)))
+    bench.begin()
+    assert finish(bench) < 1.3 * 0.467  # optimal_time() of benchmarks/motion.py
+    bench.assert_within_limits()
+
+
+def random_line(numbers: np.random.Generator) -> tuple[PathSection, ...]:
+    """Sections of a line of up to 20 cm from anywhere."""
+    while True:
+        q = numbers.uniform(SPEC.limits.lower, SPEC.limits.upper).tolist()
+        start, way, turn = ARM.fk(q), numbers.normal(0.0, 0.07, 3), numbers.normal(0.0, 0.2, 3)
+        with contextlib.suppress(Unreachable):
+            return PLANNER.along_poses(q, [[*np.add(start[:3], way), *after_rotation(start[3:], turn)]]).sections
+
+
+def test_limits_hold_along_any_line_with_pauses() -> None:
+    numbers = np.random.default_rng(1)
+    lines = [PLANNER.along_poses(SINGULAR, [BESIDE]).sections, *(random_line(numbers) for _ in range(6))]
+    for sections in lines:
+        bench = bench_of(sections, spec=replace(SPEC, home=sections[0].q[0]), deadman=True)
+        bench.press()
+        bench.begin()
+        while not bench.servo.report.arrived:
+            bench.run(numbers.uniform(0.0, 0.5))
+            bench.release()
+            bench.until_rest(1.0)
+            bench.press()
+        assert bench.q == pytest.approx(sections[-1].q[-1], abs=1e-12)
         bench.assert_within_limits()
 
 
