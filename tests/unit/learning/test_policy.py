@@ -135,6 +135,13 @@ def test_the_policy_is_called_at_its_rate_until_the_time_is_over(rig: Rig) -> No
     assert is_at_rest(rig)
 
 
+def test_turns_without_a_newer_observation_are_counted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = rig.observe(cameras=())
+    monkeypatch.setattr(rig, "observe", lambda **_: seen)
+    outcome = PolicyRunner(rig, lambda _: UP, rate_hz=20, seconds=0.5).run()
+    assert (outcome.turns, outcome.repeated) == (10, 9)
+
+
 def test_reset_gets_the_seed_and_a_rehearsal_moves_nothing(rig: Rig) -> None:
     calls: list[Any] = []
 

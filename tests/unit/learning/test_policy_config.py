@@ -20,6 +20,8 @@ CONFIG: dict[str, Any] = {
     "observation": {"state": {"state": ["q", "closed"]}, "prompt": {"text": "task"}},
     "action": {"kind": "joint_position", "gripper": {"index": 7, "threshold": 0.5}},
 }
+LEFT: dict[str, Any] = {"robot": "left", "columns": [0, 7], "kind": "joint_position"}
+RIGHT = {**LEFT, "robot": "right", "columns": [7, 14]}
 
 
 @pytest.fixture
@@ -118,12 +120,24 @@ def test_a_rig_without_the_camera_is_refused_with_both_lists(rig: hal.Rig) -> No
         {"observation": {"state": {"state": "left.speed"}}},
         {"observation": {"state": {"state": "q"}, "high": {"camera": "scene", "within": "state"}}},
         {"arms": [{"robot": "left", "columns": [0, 7], "kind": "joint_position"}]},
+        {"action": None},
+        {"action": None, "arms": [LEFT, {**RIGHT, "robot": "left"}]},
+        {"action": None, "arms": [LEFT, {**RIGHT, "columns": None}]},
+        {"action": None, "arms": [LEFT, {**RIGHT, "columns": [6, 13]}]},
+        {"action": None, "arms": [LEFT, {**RIGHT, "kind": "joint_velocity"}]},
         {"extra": 1},
     ],
 )
 def test_a_wrong_file_is_a_config_error(change: dict[str, Any]) -> None:
+    load_policy_config({**CONFIG, "action": None, "arms": [LEFT, RIGHT]})
     with pytest.raises(hal.ConfigError):
         load_policy_config({**CONFIG, **change})
+
+
+def test_a_gripper_that_a_policy_only_sees_must_be_there(rig: hal.Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig.robots["panda"], "gripper", None)
+    with raises_code(hal.NotSupported, "no_gripper"):
+        load_policy_config({**CONFIG, "action": {"kind": "joint_position"}}).robots(rig, rig.robots["panda"])
 
 
 def test_pictures_are_scaled_to_fit_and_padded() -> None:

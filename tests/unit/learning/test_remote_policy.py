@@ -103,8 +103,9 @@ def test_a_message_returns_as_it_was_sent() -> None:
         pack({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "<f8", b"shape": [2]}),
         pack({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "nonsense", b"shape": [1]}),
         pack({b"__ndarray__": True}),
+        pack({"actions": np.zeros((1, 8), complex)}),
     ],
-    ids=["no message", "empty", "cut", "objects", "too short", "no type", "no array"],
+    ids=["no message", "empty", "cut", "objects", "too short", "no type", "no array", "complex"],
 )
 def test_a_message_that_is_no_data_is_refused(data: bytes) -> None:
     with raises_code(hal.PolicyError, "policy_protocol"):
@@ -258,6 +259,7 @@ def test_two_arms_stop_together_and_the_reason_names_the_one_that_stopped() -> N
     [
         ({"robot": "lefty"}, hal.DeviceNotFound, ["lefty", "left, right"]),
         ({"columns": [0, 8]}, hal.NotSupported, ["8", "7"]),
+        ({"gripper": {"index": 7}}, hal.NotSupported, ["left", "7"]),
     ],
 )
 def test_arms_that_do_not_fit_the_file_are_refused_with_both_sides(
@@ -332,6 +334,31 @@ def test_a_policy_that_continues_from_given_actions_joins_without_a_step(rig: Ri
         assert "rtc" not in requests[0], "there is no chunk to continue yet"
 
 
+@pytest.mark.parametrize(("kind", "delay"), [("joint_position", 1), ("tcp_delta", None)])
+def test_a_server_is_sent_no_more_given_actions_than_it_takes(rig: Rig, kind: str, delay: int | None) -> None:
+    requests: list[dict[str, Any]] = []
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        requests.append(request)
+        return stay(request) if kind == "joint_position" else {"actions": np.zeros((STEPS, 6))}
+
+    action = {**CONFIG["action"], "kind": kind, "gripper": CONFIG["action"]["gripper"] if delay else None}
+    config = load_policy_config({**CONFIG, "action": action})
+    with PolicyServer(infer, metadata={"rtc_max_delay_steps": 1}) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url), config)
+        policy.reset()
+        answer = policy(rig.observe(cameras=()))
+        assert isinstance(answer, dict)
+        assert isinstance(answer["panda"][0], hal.JointChunk), "without a latency, in the same turn"
+        rig.clock.sleep(0.2)
+        policy(rig.observe(cameras=()))
+        rig.clock.sleep(0.3)
+        policy(rig.observe(cameras=()))
+        policy.close()
+    assert len(requests) == 2
+    assert requests[1].get("rtc", {}).get("delay_steps") == delay
+
+
 # What a server can do wrong.
 
 
@@ -398,6 +425,26 @@ def test_a_policy_that_is_faster_than_the_rig_allows_is_followed_at_the_rigs_spe
     assert (outcome.ended, outcome.statistics["steep"]) == ("time", 0)
     assert rig.robots["panda"].state().q_set[0] > 0.5
     assert_within_limits(rig)
+
+
+def test_a_policy_slower_than_its_chunks_is_named_as_the_cause(rig: Rig) -> None:
+    outcome = run(rig, stay, latency=1.2)
+    assert isinstance(outcome.error, hal.PolicyError)
+    assert (outcome.error.code, outcome.statistics["chunks"]) == ("policy_too_late", 1)
+
+
+def test_an_answer_that_cannot_be_read_closes_the_connection() -> None:
+    class UnreadableServer(PolicyServer):
+        def _reply(self, data: bytes) -> bytes:
+            return b"\xc1"
+
+    with UnreadableServer(stay) as server:
+        client = PolicyClient(server.url)
+        client.connect()
+        with raises_code(hal.PolicyError, "policy_protocol"):
+            client.request({}).result(10.0)
+        assert not client.connected
+        client.close()
 
 
 def test_a_first_target_far_away_is_refused(rig: Rig) -> None:
@@ -573,6 +620,9 @@ def test_an_answer_from_before_a_pause_is_not_used(rig: Rig) -> None:
         assert len(requests) == 2
         rig.clock.sleep(0.3)
         assert isinstance(chunk(), hal.JointChunk)
+        policy.restart()
+        rig.clock.sleep(3.0)
+        assert chunk() is None, "the chunk from before a pause does not end in it"
         policy.close()
 
 

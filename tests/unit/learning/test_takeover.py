@@ -23,18 +23,19 @@ def rig() -> Iterator[Rig]:
 
 
 class Wave:
-    """Chunks along a sine, asked again after every restart."""
+    """Chunks along a sine, asked again after every restart, which takes eight turns."""
 
     def __init__(self, rig: Rig) -> None:
-        self.rig, self.restarts, self.calls, self.next = rig, 0, 0, 0.0
+        self.rig, self.restarts, self.calls, self.next, self.waits = rig, 0, 0, 0.0, 0
 
     def restart(self) -> None:
         self.restarts += 1
-        self.next = 0.0
+        self.next, self.waits = 0.0, 8
 
     def __call__(self, observation: hal.Observation) -> hal.JointChunk | None:
         self.calls += 1
-        if observation.t < self.next:
+        self.waits -= 1
+        if self.waits > 0 or observation.t < self.next:
             return None
         if not self.next:
             self.start, self.t0 = self.rig.robots["panda"].state().q_set, observation.t
