@@ -504,7 +504,8 @@ def _rebuild(layout: DatasetLayout) -> int:
     info = _info(layout, count)
     episodes = [Episode(layout, number, info) for number in range(count)]
     places = [(episode.number, episode.place) for episode in episodes]
-    for path in stray_files(layout, places, video_names(info["features"])):
+    strays = stray_files(layout, places, video_names(info["features"]))
+    for path in strays:
         if not path.is_relative_to(layout.info.parent):
             raise DatasetError("belongs to no episode in episodes/", file=str(path.relative_to(layout.root)))
     tasks: dict[int, str] = {}
@@ -525,6 +526,8 @@ def _rebuild(layout: DatasetLayout) -> int:
         start += episode.length
     for file, rows in entries.items():
         write_table(layout.entry(file), entries_table(rows))
+    for path in strays:  # files of an earlier index, which LeRobot would read
+        path.unlink()
     if sorted(tasks) != list(range(len(tasks))):
         raise DatasetError(f"the episodes have tasks of the numbers {sorted(tasks)}", file="data")
     write_table(layout.tasks, tasks_table([tasks[k] for k in sorted(tasks)]), keep_schema=True)

@@ -270,7 +270,10 @@ def test_an_index_that_lists_fewer_episodes_than_there_are(out: Path, rig: Rig) 
     with raises_code(DatasetError, "index_wrong"):
         Recorder(rig, out, fps=20)
     assert any("is not in the index" in text for text in checked(out))
+    earlier = out / "meta/episodes/chunk-000/file-007.parquet"
+    shutil.copy(earlier.with_name("file-000.parquet"), earlier)
     assert "rebuilt from 3 episodes" in repair(out)[0]
+    assert not earlier.exists(), "LeRobot would read it"
     assert check_layout(out)["total_episodes"] == 3
 
 
