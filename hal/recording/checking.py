@@ -49,8 +49,12 @@ def check_dataset(dataset: Dataset, episodes: Collection[int] | None = None) -> 
         dataset: The dataset.
         episodes: Numbers of the episodes; None for all, and for the index too.
     """
+    layout = DatasetLayout(dataset.root)
     if episodes is None:
-        yield from check_index(DatasetLayout(dataset.root))
+        yield from check_index(layout)
+    tasks: list[str] | None = None
+    with contextlib.suppress(DatasetError), dataset_errors(layout.root, layout.tasks):  # check_index found the same
+        tasks = None if is_foreign(layout) else read_tasks(layout.tasks)
     start: int | None = 0
     for episode in dataset.episodes:
         first = start
@@ -59,15 +63,15 @@ def check_dataset(dataset: Dataset, episodes: Collection[int] | None = None) -> 
         except DatasetError:
             start = None  # of the episodes to come, it is not known where they begin
         if episodes is None or episode.number in episodes:
-            for check in _checks(episode, first):
+            for check in _checks(episode, first, tasks):
                 try:
                     check()
                 except DatasetError as error:
                     yield error
 
 
-def _checks(episode: Episode, start: int | None) -> Iterator[Callable[[], object]]:
-    yield partial(check_rows, episode, start)
+def _checks(episode: Episode, start: int | None, tasks: list[str] | None) -> Iterator[Callable[[], object]]:
+    yield partial(check_rows, episode, start, tasks)
     with contextlib.suppress(DatasetError):  # the first check found the same
         for camera in episode.cameras:
             for stream in episode.files(camera):
@@ -78,12 +82,13 @@ def _read_all(episode: Episode, camera: str, stream: str) -> None:
     deque(episode.pictures(camera, stream), maxlen=0)
 
 
-def check_rows(episode: Episode, start: int | None) -> None:
+def check_rows(episode: Episode, start: int | None, tasks: Sequence[str] | None = None) -> None:
     """Raise DatasetError if an episode's rows are not numbered as in the index, or times run backwards.
 
     Args:
         episode: The episode.
         start: Number of its first row in the whole dataset; None if unknown.
+        tasks: All tasks, in the order of their numbers; None if unknown.
     """
     columns, rows = episode.columns, np.arange(episode.length)
     file = episode.data_file
@@ -98,6 +103,10 @@ def check_rows(episode: Episode, start: int | None) -> None:
     need(np.diff(columns["index"]) == 1, "index does not count the rows")
     need(start is None or columns["index"][0] == start, f"index does not begin with {start}")
     need(np.diff(columns["task_index"]) == 0, "has rows of several tasks")
+    task = int(columns["task_index"][0])
+    need(
+        tasks is None or [*tasks[task : task + 1]] == [episode.task], f"has rows of another task than {episode.task!r}"
+    )
     need(np.abs(columns["timestamp"] - rows / episode.fps) < _CLOSE + 1e-6 * rows, "timestamp is not that of the grid")
     for name, times in episode.stamps.items():
         if name == "grid":
@@ -151,6 +160,10 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
             yield error
     if start is not None and start != info["total_frames"]:
         yield wrong(layout.info, f"lists {info['total_frames']} rows, and the episodes have {start}")
+    with contextlib.suppress(DatasetError):  # reported with the rows of its episodes
+        rows = sum(_count_rows(layout, path) for path in layout.finished() if path.is_relative_to(layout.root / "data"))
+        if rows > info["total_frames"]:  # too few are reported with their episode
+            yield wrong(layout.info, f"lists {info['total_frames']} rows, and the files in data/ have {rows}")
     try:
         with dataset_errors(layout.root, layout.stats):
             stats = json.loads(layout.stats.read_text(encoding="utf-8"), parse_constant=_no_constant)
@@ -194,6 +207,14 @@ def _check_entry(
             f"the task {about['task']!r} is missing", file=str(layout.tasks.relative_to(layout.root)), episode=number
         )
     return end
+
+
+def _count_rows(layout: DatasetLayout, path: Path) -> int:
+    """Return the number of rows in a file, also of those that belong to no episode."""
+    import pyarrow.parquet as pq
+
+    with dataset_errors(layout.root, path):
+        return int(pq.read_metadata(path).num_rows)
 
 
 def _no_constant(name: str) -> Any:

@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,11 +91,15 @@ class ExportJob:
         """Report that the numbers of an episode are written."""
         self._step(content, content.rows)
 
+    @cached_property
+    def _total(self) -> int:
+        """Number of rows of numbers and of pictures that are written in all."""
+        return sum(each.rows * (1 + len(each.pictures)) for each in self.contents)
+
     def _step(self, content: EpisodeContent, count: int) -> None:
         self._done += count
         if self.report is not None:
-            total = sum(each.rows * (1 + len(each.pictures)) for each in self.contents)
-            self.report(ExportProgress(content.episode.number, min(1.0, self._done / max(1, total))))
+            self.report(ExportProgress(content.episode.number, min(1.0, self._done / max(1, self._total))))
 
     def about(self) -> dict[str, Any]:
         """Return the metadata of all episodes together."""

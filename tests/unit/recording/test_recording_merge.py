@@ -27,6 +27,7 @@ from hal.recording import (
     merging,
     pack,
     repair,
+    set_task,
 )
 from hal.recording import (
     dataset as dataset_module,
@@ -124,6 +125,13 @@ def test_what_cannot_be_merged_is_refused(part: Path, tmp_path: Path) -> None:
     (copy / "meta/info.json").write_text(json.dumps(info | {"fps": 10}))
     with raises_code(CommandError, "other_dataset"):
         merge([part, copy], out)
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    about = json.loads((copy / "episodes/000000.json").read_text())
+    changed = about | {"cameras": about["cameras"] | {"wrist": about["cameras"]["wrist"] | {"depth_unit_m": 0.01}}}
+    (copy / "episodes/000000.json").write_text(json.dumps(changed))
+    with raises_code(CommandError, "other_dataset"):
+        merge([part, copy], out)
+    (copy / "episodes/000000.json").write_text(json.dumps(about))
     (copy / "meta/info.json").write_text(json.dumps(info | {"total_episodes": 1}))
     with raises_code(DatasetError, "index_wrong"):
         pack(copy)
@@ -217,6 +225,7 @@ def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
     assert pack(demo) == 5
     assert rows.stat().st_ino == before[0], "a full file is linked"
     mark_episodes(demo, {4: True})
+    assert Dataset(demo).episodes[4].columns["next.success"][-1], "the rows have the mark, too"
     delete_episodes(demo, [1, 2])
     check_layout(demo)
     assert not list(check_dataset(Dataset(demo)))
@@ -379,17 +388,47 @@ def test_a_mount_point_is_not_replaced(part: Path, tmp_path: Path, monkeypatch: 
     assert len(list(demo.glob("data/*/*"))) == 1
 
 
+def test_rows_stay_in_their_file_only_if_nothing_in_it_changes(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(merging, "GROUP", 2)
+    demo = tmp_path / "demo"
+    merge([part, part], demo)
+
+    def tasks_of_rows() -> list[str]:
+        found = pq.read_table(demo / "meta/tasks.parquet").to_pydict()
+        texts = dict(zip(found["task_index"], found["__index_level_0__"], strict=True))
+        rows = pq.read_table(demo / "data")["task_index"].to_pylist()
+        assert len(rows) == sum(map(len, Dataset(demo).episodes)), "no row of a deleted episode is left"
+        return [texts[row] for row in rows]
+
+    set_task(demo, "lower", [0])  # which is now the first task, also for the rows of the other file
+    assert not list(check_dataset(Dataset(demo)))
+    assert tasks_of_rows() == [episode.task for episode in Dataset(demo).episodes for _ in range(episode.length)]
+    delete_episodes(demo, [3])
+    assert tasks_of_rows() == [episode.task for episode in Dataset(demo).episodes for _ in range(episode.length)]
+    table = pq.read_table(demo / "data/chunk-000/file-001.parquet")
+    pq.write_table(pa.concat_tables([table, table]), demo / "data/chunk-000/file-001.parquet")
+    assert [error.file for error in check_dataset(Dataset(demo))] == ["meta/info.json"], "LeRobot counts all rows"
+    swapped = table.set_column(table.schema.get_field_index("task_index"), "task_index", pa.array([0] * len(table)))
+    pq.write_table(swapped, demo / "data/chunk-000/file-001.parquet")
+    assert [error.episode for error in check_dataset(Dataset(demo))] == [2], "another task than its metadata"
+
+
 def test_large_videos_are_linked_and_small_ones_joined_up_to_a_size(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = (part / "videos/observation.images.wrist/chunk-000/file-000.mp4").stat().st_size
     monkeypatch.setattr(merging, "VIDEO_MB", 2.9e-6 * size)
-    merge([part, part, part], tmp_path / "joined")
+    merge([part, part, part], joined := tmp_path / "joined")
     videos = [episode.place.video("wrist") for episode in Dataset(tmp_path / "joined").episodes]
     assert [file for file, _ in videos] == [0, 0, 1, 1, 2, 2]
     assert [first for _, first in videos[::2]] == [0, 0, 0]
     check_layout(tmp_path / "joined")
     monkeypatch.setattr(merging, "VIDEO_MB", 1.5e-6 * size)
+    delete_episodes(joined, [0, 5])
+    for one, other in zip(Dataset(part).episodes[::-1] * 2, Dataset(joined).episodes, strict=True):
+        assert pictures_of(one, "color") == pictures_of(other, "color"), "a file of which a part is left is no link"
     merge([part], tmp_path / "linked")
     for one, other in zip(Dataset(part).episodes, Dataset(tmp_path / "linked").episodes, strict=True):
         assert one.files("wrist")["color"].samefile(other.files("wrist")["color"])
