@@ -261,7 +261,7 @@ class Contract:
         for ability in self.abilities:
             given, out = bench.has(ability), ability in self.left_out
             assert given or out, (
-                f"the bench has no {ability!r}: give it one (see {type(bench).__name__}.{ability}), or leave it out: "
+                f"neither bench nor driver has {ability!r}: add it (see the contract's docstring), or leave it out: "
                 f"class {type(self).__name__}(..., left_out={{{ability!r}: 'why'}})"
             )
             assert not (out and bench.was_given(ability)), (

@@ -376,7 +376,10 @@ class RobotContract(Contract):
                 _engage(bench)
         bench.driver.recover()
         assert _run(bench, 2)[-1].fault is None, "recover clears the fault"
-        assert _ramp(bench, _RISE)[-1].q[bench.joint] == pytest.approx(before[bench.joint] + _RISE, abs=0.01)
+        reached = _ramp(bench, _RISE)[-1].q[bench.joint]
+        assert reached == pytest.approx(before[bench.joint] + _RISE, abs=0.01), (
+            "after recover the arm follows from where it stopped; set-points of the time of the fault are not kept"
+        )
 
     def test_an_unknown_fault_to_inject_is_refused(self, bench: RobotBench) -> None:
         with pytest.raises((CommandError, NotSupported)):

@@ -66,7 +66,7 @@ def test_a_wrong_driver_fails_its_check(output: str, name: str) -> None:
 def test_a_failed_check_shows_the_compared_values_and_what_to_do(output: str) -> None:
     assert "E   assert ((47, 64, 3), dtype('uint8')) == ((48, 64, 3), dtype('uint8'))" in output
     assert "color: must be (48, 64, 3) of uint8" in output
-    assert "the bench has no 'lose': give it one" in output
+    assert "neither bench nor driver has 'lose': add it" in output
 
 
 def test_a_check_that_is_left_out_is_not_collected() -> None:
