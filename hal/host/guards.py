@@ -65,14 +65,15 @@ class ArmElsewhere:
             return self._stop
         self._seen = record
         follows = record.status in _FOLLOWS_SETPOINT
-        if follows and record.controller is ControlMode.TORQUE:  # its set-point is where it was measured
+        stops = follows or record.session != 0  # one that is lost or has a fault may still be on its way
+        if stops and record.controller is ControlMode.TORQUE:  # its set-point is where it was measured
             self._stop = record.q_set, [q + _TORQUE_STOP * v for q, v in zip(record.q_set, record.dq_set, strict=True)]
             return self._stop
         q: Floats = record.q_set
         if not follows or record.controller is not ControlMode.POSITION:  # it may be elsewhere than its set-point
             state = self._mail.get_state()
             q = self._stop[0] if state is None else state.q.tolist()
-        if follows:
+        if stops:
             jerk = self._jerk if record.controller is ControlMode.POSITION else self._compliant_jerk
             limits = zip(record.q_set, record.dq_set, self._acceleration, jerk, strict=True)
             self._stop = q, [x + _OLD * v + copysign(stop_distance(abs(v), A, J), v) for x, v, A, J in limits]

@@ -24,10 +24,10 @@ MEASURED = SET - 0.01
 SPEED = np.array([0.4, -0.3, 0.0, 0.2, 0.5, -0.4, 0.3])
 
 
-def elsewhere(status: RobotStatus, controller: ControlMode) -> tuple[Any, Any]:
+def elsewhere(status: RobotStatus, controller: ControlMode, session: int = 1) -> tuple[Any, Any]:
     """Return what is taken of an arm whose set-point moves at ``SPEED``."""
     record = ServoRecord(
-        status, Trip.NONE, Limited.NONE, 1, 1, False, 0, 0.0, 0.0, SET.tolist(), SPEED.tolist(), controller
+        status, Trip.NONE, Limited.NONE, 1, session, False, 0, 0.0, 0.0, SET.tolist(), SPEED.tolist(), controller
     )
     mail: Any = SimpleNamespace(peek=lambda: record, get_state=lambda: SimpleNamespace(q=MEASURED))
     q, end = ArmElsewhere(SPEC, mail)()
@@ -59,5 +59,19 @@ def test_an_arm_with_a_controller_is_where_it_is_measured_and_stops_as_softly_as
 
 
 def test_an_arm_that_may_be_moved_by_hand_is_where_it_is_measured() -> None:
-    for got in elsewhere(RobotStatus.IDLE, ControlMode.POSITION):
-        assert np.array_equal(got, MEASURED)
+    for status in (RobotStatus.IDLE, RobotStatus.FAULT):
+        for got in elsewhere(status, ControlMode.POSITION, 0):
+            assert np.array_equal(got, MEASURED)
+
+
+@pytest.mark.parametrize("status", [RobotStatus.LOST, RobotStatus.FAULT])
+def test_an_arm_that_was_lost_on_its_way_still_stops(status: RobotStatus) -> None:
+    q, end = elsewhere(status, ControlMode.POSITION)
+    assert np.array_equal(q, MEASURED)
+    assert end == pytest.approx(stop(SPEC.limits.jerk) + 0.004 * SPEED)
+
+
+def test_an_arm_that_follows_torques_stops_in_the_way_of_a_tenth_of_a_second() -> None:
+    q, end = elsewhere(RobotStatus.FOLLOWING, ControlMode.TORQUE)
+    assert np.array_equal(q, SET)  # where it was measured
+    assert end == pytest.approx(SET + 0.1 * SPEED)
