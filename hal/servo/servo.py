@@ -382,13 +382,23 @@ class Servo:
             return Trip.BAD_READING
         if dq is not smoother.dq and dq is not None and not self._is_sound(dq):
             return Trip.BAD_READING
+        if reading.tau_commanded is not None and not self._has_sound_torques(reading):
+            return Trip.BAD_READING
         if not is_alive(now, reading.t, self._torque.patience if self._torque.active else SILENCE):
             return Trip.DEVICE_LOST  # it repeats an old reading
         return _NO_TRIP
 
     def _is_known(self, reading: Reading, device: Trip) -> bool:
-        """Return whether positions and speeds in this reading are valid, given the trip ``device`` that it causes."""
-        return not device or (device is Trip.FAULT and self._is_position(reading.q) and self._is_sound(reading.dq))
+        """Return whether the numbers of this reading are valid, given the trip ``device`` that it causes."""
+        if device is Trip.FAULT:
+            sound = self._is_position(reading.q) and self._is_sound(reading.dq)
+            return sound and self._has_sound_torques(reading)
+        return not device
+
+    def _has_sound_torques(self, reading: Reading) -> bool:
+        """Return whether the commanded torques in this reading, from which the next ones step on, can be used."""
+        tau = reading.tau_commanded
+        return tau is None or not self._torque.active or (len(tau) == self._smoother.n and isfinite(hypot(*tau)))
 
     def _overruns(self) -> Trip:
         """Return ``Trip.LIMIT`` if an arm that follows torques, or is braked by them, runs into a limit."""

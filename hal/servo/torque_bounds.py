@@ -237,8 +237,12 @@ class TorqueBounds:
                 share = min(share, tcp_share)
         wanted = tau[0] + share * tau[1]
         total: list[float] = wanted.tolist()
-        if hypot(*total) <= self._weakest:
+        size = hypot(*total)
+        if size <= self._weakest:
             return total
+        if not isfinite(size):  # never seen; cut below, it would be the greatest torque
+            envelope.limited |= Limited.TORQUE
+            return [0.0] * len(total)
         cut = [max(-limit, min(limit, x)) for x, limit in zip(total, self._torque, strict=True)]
         if cut != total:
             envelope.limited |= Limited.TORQUE

@@ -371,6 +371,7 @@ class TestTheDevice:
         "not a number": lambda reading: reading._replace(dq=(math.nan,) * N),
         "too few": lambda reading: reading._replace(q=(0.0,) * 3),
         "absurd": lambda reading: reading._replace(dq=(1e9,) * N),
+        "torques": lambda reading: reading._replace(tau_commanded=(math.nan,) * N),
     }
 
     @pytest.mark.parametrize("what", BAD)
@@ -393,6 +394,14 @@ class TestTheDevice:
         arm.until_held()
         assert arm.servo.report.trip is Trip.BAD_READING
         arm.assert_within_limits()
+
+    def test_torques_that_cannot_be_are_not_stepped_on_from_in_a_fault_either(self) -> None:
+        arm = moving()
+        fault = Fault("reflex", "a reflex", "recover")
+        arm.tamper = lambda reading: reading._replace(tau_commanded=(math.nan,) * N, fault=fault)
+        arm.tick()
+        assert arm.state == (RobotStatus.FAULT, Trip.FAULT)
+        assert np.isfinite(arm.tau).all()
 
     def test_an_old_reading_counts_as_silence_sooner_than_otherwise(self) -> None:
         arm = moving()

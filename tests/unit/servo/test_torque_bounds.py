@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 
 import numpy as np
@@ -186,3 +187,11 @@ def test_the_torques_of_a_controller_change_in_proportion() -> None:
     assert made.together([0.0] * N, [0.5, -0.5, *STILL[2:]]) == [0.5, -0.5, *STILL[2:]]
     tau = made.together([1.0, *STILL[1:]], [11.0, -5.0, *STILL[2:]])
     assert tau == pytest.approx([1.0 + RATE * DT, -0.5 * RATE * DT, *STILL[2:]])
+
+
+def test_torques_of_a_controller_that_are_no_numbers_are_none() -> None:
+    made, envelope = bounds()
+    arm = ArmInMotion(HOME, STILL, Inertia(np.eye(N), N, inverted=False))
+    tau = np.array([[math.nan, *STILL[1:]], STILL])
+    assert made.shared(tau, np.zeros(3), arm, np.zeros(3)) == STILL
+    assert envelope.limited
