@@ -366,6 +366,10 @@ class RolloutRun:
             self._announce(f"episode {number}: release {self.button}, then hold it to run the policy{marks}")
 
     def _show(self, number: int, seconds: float) -> None:
+        if self.pad is not None and self.pad.finished and self.deadman is not None and not self.deadman.held:
+            from hal.errors import CommandError
+
+            raise CommandError("the recorded pad has ended, and nothing holds the dead-man", code="pad_finished")
         self.line.update(lambda: f"  episode {number}: {seconds:6.1f} of {self.args.seconds:g} s")
         driver, now = self._driver(), self.rig.clock.now()
         if driver != self._noted or now >= self._next_note:

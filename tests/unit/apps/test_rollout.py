@@ -220,6 +220,13 @@ def test_pages_show_who_drives_and_the_figures_of_a_policy_while_it_drives(folde
     assert notes[-1] == ""
 
 
+def test_a_recorded_pad_that_has_ended_ends_the_run(folder: Path) -> None:
+    pad = write_pad(folder, until=0.3)
+    done = rollout("--policy", "policies:Reach", "--deadman", "--pad", pad, *FAST)
+    assert done.returncode == 2
+    assert "the recorded pad has ended" in done.stderr
+
+
 def test_takeover_needs_a_dead_man(folder: Path) -> None:
     assert rollout("--policy", "policies:Reach", "--takeover", "--unattended", *FAST).returncode == 2
 
