@@ -135,11 +135,14 @@ def test_a_push(robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], b
 )
 def test_a_push_to_a_goal(robot: Emulator, rig: hal.Rig, reason: str, seen: bool, phases: list[str]) -> None:
     """The object that is seen does not move: there is none."""
+    arm = arm_of(rig)
+    assert arm.gripper is not None
+    arm.gripper.open()  # the hand would go on holding an object that the test before put there
     robot.control.send("hand object none")
     corners = POSE.position + 0.02 * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     found = object_from_points(corners) if seen else None
     goal = POSE.position[:2] + [0.04, 0.0]
-    result = push_to(arm_of(rig), lambda: found, goal, tries=1, approach=0.03, speed=0.3, unattended=True)
+    result = push_to(arm, lambda: found, goal, tries=1, approach=0.03, speed=0.3, unattended=True)
     assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
 
 
