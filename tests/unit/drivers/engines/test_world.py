@@ -40,6 +40,14 @@ def pose(world: Any, name: str, link: str | None = None) -> Pose:
     return Pose(answer["position"], answer["orientation"])
 
 
+def trimesh_inertia(radius: float, length: float, mass: float) -> list[float]:
+    """The moments of a capsule (3,), kg m2, computed from its surface."""
+    import trimesh
+
+    capsule = trimesh.creation.capsule(height=length, radius=radius, count=(64, 64))
+    return [float(value) * mass / capsule.volume for value in np.diag(capsule.moment_inertia)]
+
+
 def mug(**changes: object) -> BodySpec:
     """An object from a URDF."""
     return BodySpec("mug", (0.3, 0.4, 0.1), UPRIGHT, "urdf", urdf=data("objects/mug.urdf"), **changes)
@@ -157,6 +165,17 @@ class TestDynamics:
         held = world.dynamics("cube")
         world.set_dynamics("cube", **before)
         assert {name: held[name] for name in values} == values
+
+    def test_round_objects_have_the_inertia_of_their_shape(self, engine: Engine) -> None:
+        pole = BodySpec("pole", (1, 0, 1), UPRIGHT, "cylinder", radius=0.2, length=0.6, mass=3.0)
+        pill = replace(pole, name="pill", position=(2, 0, 1), shape="capsule")
+        ball = replace(pole, name="ball", position=(0, 0, 1), shape="sphere", length=None)
+        world = engine.world(ball, pole, pill)
+        assert world.dynamics("ball")["inertia"] == pytest.approx([3.0 * 0.4 * 0.04] * 3)
+        assert world.dynamics("pole")["inertia"] == pytest.approx([0.12, 0.12, 0.06])
+        if engine.name == "mujoco":  # PyBullet takes a box around a capsule
+            assert world.dynamics("pill")["inertia"] == pytest.approx(trimesh_inertia(0.2, 0.6, 3.0), rel=0.01)
+        world.close()
 
     def test_a_new_mass_keeps_the_shape_of_the_inertia(self, world: Any) -> None:
         mass = world.dynamics("panda", "panda_link3")["mass"]
