@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 ENDED_EARLY = 1
 LEROBOT = "lerobot:"
 """Begins a policy that is the checkpoint of one that LeRobot trained."""
-LISTENING = "listening at "
-"""Begins the line in which the server of such a policy prints its address."""
 LOAD_TIMEOUT = 300.0
 """Longest time that such a policy may take to load, s."""
 PRINTED_LINES = 20
@@ -197,6 +195,8 @@ def _lerobot_server(checkpoint: str) -> Iterator[str]:
 
 def _read_server(lines: Any, printed: deque[str], address: queue.SimpleQueue[str]) -> None:
     """Read what a policy's server prints until it ends, pass on its address, and show the rest."""
+    from hal.apps.serve_lerobot import LISTENING
+
     for line in lines:
         if line.startswith(LISTENING):
             address.put(line.removeprefix(LISTENING).strip())

@@ -27,6 +27,8 @@ from hal.errors import CommandError, DriverMissing
 
 STATE, IMAGES, ACTION = "observation.state", "observation.images.", "action"
 GRIPPER = "gripper"
+LISTENING = "listening at "
+"""Begins the line with the server's address, which ``apps/rollout.py`` reads."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -73,7 +75,7 @@ def _main(args: argparse.Namespace) -> int:
         metadata["rtc_max_delay_steps"] = policy.rtc_delay
     with PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, host=args.host, port=args.port) as server:
         print(f"{policy.kind} for {', '.join(metadata['joints'])} at {metadata['policy_config']['rate_hz']} Hz")
-        print(f"listening at {server.url}", flush=True)
+        print(f"{LISTENING}{server.url}", flush=True)
         server.wait()
     return 0
 
