@@ -46,6 +46,7 @@ def test_random_scenes_have_pictures_and_true_poses(tmp_path: Path) -> None:
 
 
 def test_an_arm_of_ones_own_goes_up(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet_data", reason="its URDF comes with PyBullet")
     assert "6 joints" in run("own_arm.py", tmp_path)
 
 
