@@ -96,6 +96,15 @@ def test_an_arm_outside_comes_back_in_and_stays() -> None:
     assert 0.99 < smoother.q[0] <= 1.0
 
 
+def test_a_lower_jerk_counts_at_once() -> None:
+    smoother = JointSmoother(LIMITS, 1.0 / 240.0)
+    smoother.anchor((0.5, -0.7))
+    play(smoother, [("follow", (0.0, 0.0), 1)])
+    smoother.limit_jerk((10.0, 10.0))
+    path = play(smoother, [("follow", (0.9, 0.0), 600)])
+    assert 0.95 < max(q for q, _ in path) <= 1.0
+
+
 def test_velocity_is_reached_and_the_stop_ends_where_it_was_foretold() -> None:
     smoother = JointSmoother(LIMITS, 1 / 240)
     for _ in range(60):

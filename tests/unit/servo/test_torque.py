@@ -18,8 +18,10 @@ from hal.commands import Kind, Session
 from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
 from hal.errors import Fault
+from hal.kinematics.collision_model import CollisionModel
+from hal.servo.collisions import CollisionGuard
 from hal.servo.servo import Servo
-from hal.specs import WorkspaceSpec
+from hal.specs import BoxSpec, CollisionSpec, WorkspaceSpec
 from hal.types import Limited, RobotStatus, Trip
 
 HEAVY = 1e4  # kg m2: no torque makes such an arm fast, so that none is held back
@@ -455,3 +457,20 @@ class TestTheDevice:
         arm.drive(0.5, one(0, 5.0))
         assert all(not any(setpoint.tau or NOTHING) for setpoint in arm.given)
         assert arm.q == pytest.approx(panda().home)
+
+
+def test_torques_down_on_a_table_trip_before_its_margin() -> None:
+    arm = wheels()
+    table = BoxSpec("table", (0.7, 0.0, 0.35), (0.0, 0.0, 0.0, 1.0), (0.5, 1.0, 0.05))
+    model = CollisionModel([arm.spec], CollisionSpec(own=False, boxes=(table,)))
+    arm.servo.set_guard(CollisionGuard(model, arm.servo.smoother))
+    apart = []
+    for _ in range(round(3.0 / arm.dt)):
+        arm.drive(arm.dt, one(1, 2.0))
+        model.place(arm.q)
+        apart.append(model.distances().min())
+    assert arm.state == (RobotStatus.TRIPPED, Trip.LIMIT)
+    assert Limited.COLLISION in arm.limited
+    assert not arm.by_torques
+    assert apart[0] > 0.03
+    assert 0.01 < min(apart) < 0.02
