@@ -186,6 +186,7 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
 def test_a_skill_ends_after_its_timeout_in_every_phase(rig: hal.Rig, phase: str) -> None:
     """A dead-man that is released for ever pauses the skill until then, however long it may be released."""
     pad, arm = rig.driver("pad"), rig.robots["panda"]
+    deadman = rig.gamepads["pad"].hold("l2")  # before it is pressed: a skill begins with a new press
     arm.gripper.grip(1.0)
     pad.press("l2")
     rig.clock.sleep(0.1)
@@ -200,7 +201,7 @@ def test_a_skill_ends_after_its_timeout_in_every_phase(rig: hal.Rig, phase: str)
         POSE,
         speed=1.0,
         hold=30.0,
-        deadman=rig.gamepads["pad"].hold("l2"),
+        deadman=deadman,
         patience=math.inf,
         timeout=15.0,
         progress=at(phase, release),
