@@ -7,8 +7,6 @@ import math
 import statistics
 import time
 
-import pytest
-
 from ..driver import PadReading
 from ..errors import HalError
 from ..gamepad import Gamepad
@@ -21,6 +19,8 @@ _TURNS = 3000
 """Polls within which a change must show."""
 _SLOW = 0.005
 """s; a poll without a time-out whose median is longer blocks."""
+_BEHIND = 0.05
+"""s by which ``t_alive`` may differ from the present while the pad is connected."""
 _WAIT = 0.05
 """s; a time-out that the checks try."""
 _SLACK = 2.0
@@ -108,20 +108,29 @@ class GamepadContract(Contract):
         bench.driver.open()
         _poll_until_pressed(bench)
         readings = [_poll(bench) for _ in range(20)]
-        if bench.driver.proves_liveness:
-            passed = 19 * bench.dt if not bench.real_time else bench.now - readings[0].t_alive
-            life = readings[-1].t_alive - readings[0].t_alive
-            assert life == pytest.approx(passed, abs=0.05), "t_alive advances while the pad is connected"
+        if not bench.driver.proves_liveness:
+            return
+
+        def behind() -> float:
+            passed = bench.now - readings[0].t_alive if bench.real_time else 19 * bench.dt
+            return passed - (readings[-1].t_alive - readings[0].t_alive)
+
+        deadline = time.monotonic() + _SLACK
+        while bench.real_time and abs(behind()) > _BEHIND and time.monotonic() < deadline:
+            readings.append(_poll(bench))  # on a busy machine a sign of life may be late
+        assert abs(behind()) <= _BEHIND, "t_alive advances while the pad is connected"
 
     @needs("freeze")
     def test_t_alive_stops_when_the_pad_is_silent(self, bench: PadBench) -> None:
         bench.driver.open()
-        last = [_poll(bench) for _ in range(5)][-1]
+        last = [_poll(bench) for _ in range(5)][-1].t_alive
+        if bench.real_time:
+            last = max(last, bench.now)  # a sign of life from before may arrive late
         bench.freeze()
         for _ in range(3):
             _poll(bench)  # events that were under way
         silent = [_poll(bench) for _ in range(30)]
-        assert silent[-1].t_alive <= last.t_alive + 5 * bench.dt, "without a sign of life t_alive must not advance"
+        assert silent[-1].t_alive <= last + 5 * bench.dt, "without a sign of life t_alive must not advance"
         assert silent[-1].t_alive == silent[5].t_alive or not silent[-1].connected
 
     # Waiting.
