@@ -147,6 +147,7 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
     pad, deadman = rig.driver("pad"), rig.gamepads["pad"].hold("l2")
     log = rig.driver("panda.gripper").log
     pauses = dict.fromkeys(PHASES, 0)
+    rig.robots["panda"].gripper.grip(1.0)  # so that there is something to open
     pad.press("l2")
 
     def pause(now: SkillProgress) -> None:
@@ -155,7 +156,7 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
 
         def tick() -> None:
             elapsed = rig.clock.now() - t
-            if 0.1 <= elapsed < 0.15:
+            if 0.08 <= elapsed < 0.13:  # once, at 0.1 s: calls are 0.05 s apart, and a step of 4 ms early or late
                 pad.release("l2")
                 pauses[now.phase] = len(log)
             elif elapsed >= 1.1:
