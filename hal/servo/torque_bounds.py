@@ -160,16 +160,17 @@ class TorqueBounds:
         self._decay = min(_DECAY, _STABLE / dt)
         self._ranges = list(zip(limits.lower, limits.upper, strict=True))
         """Ranges of the joints in this session, rad."""
-        self._box: list[tuple[float, float]] = []
+        workspace = envelope.workspace
+        self._box = [] if workspace is None else list(zip(workspace.lower, workspace.upper, strict=True))
         """Ranges of the tcp, m; empty if unlimited."""
 
     def open_session(self, q: Floats) -> None:
         """Open a session with the arm at ``q`` (n,), rad: outside a limit it may only come back in."""
         self.velocity, self.tcp_speed = self._envelope.velocity, self._envelope.tcp_speed
-        self._ranges = _around(self._limits.lower, self._limits.upper, q)
+        self._ranges = _around(self._limits.lower, self._limits.upper, q, self._ranges)
         workspace = self._envelope.workspace
         if workspace is not None:
-            self._box = _around(workspace.lower, workspace.upper, self._kinematics.fk(q)[:3])
+            self._box = _around(workspace.lower, workspace.upper, self._kinematics.fk(q)[:3], self._box)
 
     # Torques within the bounds.
 
@@ -414,9 +415,24 @@ def _greatest_share(a: Any, b: Any, cap: float) -> float:
     return max(0.0, min(1.0, (sqrt(max(0.0, ab * ab + bb * rest)) - ab) / bb))
 
 
-def _around(lower: Floats, upper: Floats, at: Floats) -> list[tuple[float, float]]:
-    """Return the ranges from ``lower`` to ``upper``, widened where ``at`` is outside or at their edge."""
-    return [(min(low, x - _SLACK), max(high, x + _SLACK)) for low, high, x in zip(lower, upper, at, strict=True)]
+def _around(
+    lower: Floats, upper: Floats, at: Floats, before: Sequence[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """Return the ranges from ``lower`` to ``upper``, widened where ``at`` is outside or at their edge.
+
+    They were ``before`` in the session before this one.
+    """
+    each = zip(lower, upper, at, before, strict=True)
+    return [(_least(low, x, least), -_least(-high, -x, -most)) for low, high, x, (least, most) in each]
+
+
+def _least(low: float, x: float, before: float) -> float:
+    """Return the lower end of a range that begins at ``low``, with an arm at ``x``.
+
+    An arm that is where the session before it ended gets no more room, or it could creep out from session to session.
+    """
+    moved = before >= low or x < before - _SLACK  # it was inside, or something else has moved it
+    return min(low, x - _SLACK if moved else max(x - _SLACK, min(x, before)))
 
 
 def _stays_within(ranges: Sequence[tuple[float, float]], at: Floats, v: Floats, w: Floats, seconds: float) -> bool:

@@ -311,6 +311,16 @@ class TestGuards:
         assert arm.servo.report.trip is Trip.LIMIT
         arm.until_held()
         assert arm.q[0] < 2.96
+        for _ in range(3):  # no way out in small steps
+            arm.servo.close_session()
+            arm.run(0.1)
+            assert not arm.servo.active
+            arm.servo.open_session(Session(1, 0.3, 0.25, True), arm.inbox())
+            arm.press_again()
+            arm.drive(0.3, one(0, 3.0))
+            assert arm.servo.report.trip is Trip.LIMIT
+            arm.until_held()
+            assert arm.q[0] < 2.955
         arm.press_again()
         arm.drive(0.3, one(0, -3.0))
         assert arm.state == (RobotStatus.FOLLOWING, Trip.NONE)
