@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ..deadman import Deadman
     from ..rig import Rig
     from ..robot import Robot
+    from ..servo.controllers import Controller
     from .takeover import Takeover
 
 __all__ = [
@@ -158,6 +159,7 @@ class PolicyRunner:
         seconds: float = 30.0,
         deadman: Deadman | None = None,
         unattended: bool = False,
+        controller: Controller | None = None,
         cameras: Collection[str] | None = None,
         history: int = 1,
         success: Callable[[Rig, Observation], bool] | None = None,
@@ -176,6 +178,7 @@ class PolicyRunner:
             seconds: Longest time of an episode, without pauses, s.
             deadman: Dead-man; something that really moves needs it, or ``unattended``.
             unattended: Let a real arm move without a dead-man.
+            controller: What makes the arms follow, as in :meth:`.Robot.control`; in a takeover as well.
             cameras: Names of the observed cameras; None for all.
             history: Number of states per observation.
             success: Called as ``success(rig, observation)`` in each turn, before the policy; True ends the episode.
@@ -196,7 +199,12 @@ class PolicyRunner:
         if takeover is not None and takeover.teleop.robot.name not in self.robots:
             raise CommandError(f"the policy does not move {takeover.teleop.robot.name}, which the takeover drives")
         self._rate, self._seconds = rate_hz, seconds
-        self._deadman, self._unattended = deadman, unattended
+        self._terms: dict[str, Any] = {
+            "rate_hz": rate_hz,
+            "deadman": deadman,
+            "unattended": unattended,
+            "controller": controller,
+        }
         self._cameras, self._history = cameras, history
         self._success, self._mark, self._takeover = success, mark, takeover
 
@@ -221,8 +229,7 @@ class PolicyRunner:
         """
         self.rig.forget_observations()
         tally = _Tally(judged=self._success is not None)
-        terms: Any = {"deadman": self._deadman, "rate_hz": self._rate, "unattended": self._unattended}
-        controls = {name: robot.control(**terms) for name, robot in self.robots.items()}
+        controls = {name: robot.control(**self._terms) for name, robot in self.robots.items()}
         stopped: list[str] = []
         try:
             with _policy_errors(PolicyError):

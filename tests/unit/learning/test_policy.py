@@ -135,6 +135,20 @@ def test_the_policy_is_called_at_its_rate_until_the_time_is_over(rig: Rig) -> No
     assert is_at_rest(rig)
 
 
+def test_a_policy_drives_with_the_controller_that_it_is_given(rig: Rig) -> None:
+    seen: list[hal.ControlMode] = []
+
+    def policy(observation: hal.Observation) -> hal.Twist:
+        seen.append(observation.robots["panda"].controller)
+        return UP
+
+    before = height(rig)
+    outcome = PolicyRunner(rig, policy, rate_hz=20, seconds=1.0, controller=hal.OperationalSpace()).run()
+    assert outcome.ended == "time"
+    assert seen[-1] is hal.ControlMode.OPERATIONAL_SPACE
+    assert height(rig) - before > 0.03
+
+
 def test_turns_without_a_newer_observation_are_counted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = rig.observe(cameras=())
     monkeypatch.setattr(rig, "observe", lambda **_: seen)
