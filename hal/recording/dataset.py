@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import weakref
 from collections import deque
 from collections.abc import Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, overload
@@ -87,6 +88,9 @@ class KeptRows(NamedTuple):
     """Row after the last one."""
 
 
+_SAME = ("cameras", "features", "rig", "versions")
+"""Metadata that is long and nearly always that of the other episodes."""
+_shared = lru_cache(maxsize=64)(json.loads)
 _MAY_CHANGE = {"files": None, "task": None, "success": None}
 """Metadata that an episode can get later."""
 
@@ -114,11 +118,19 @@ class Episode:
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """Content of ``episodes/N.json``: seed, cameras, gaps, versions, the rig's whole configuration."""
+        """Content of ``episodes/N.json``: seed, cameras, gaps, versions, the rig's whole configuration.
+
+        Not to be changed: what is the same in many episodes is in memory once.
+        """
         if self._about is not None:
             return self._about
         self._version = file_version(self._layout.about(self.number))
-        return read_about(self._layout, self.number)
+        return self._read_about()
+
+    def _read_about(self) -> dict[str, Any]:
+        """Return ``episodes/N.json``, with the values of :data:`_SAME` shared by all episodes."""
+        found = read_about(self._layout, self.number)
+        return found | {key: _shared(json.dumps(found[key])) for key in _SAME if key in found}
 
     def _is_current(self) -> bool:
         """Return whether the known place is that of the episode's files now."""
@@ -132,7 +144,7 @@ class Episode:
         known = self.info
         if self._is_current():
             return
-        version, found = file_version(self._layout.about(self.number)), read_about(self._layout, self.number)
+        version, found = file_version(self._layout.about(self.number)), self._read_about()
         if known | _MAY_CHANGE != found | _MAY_CHANGE:
             raise self._changed()
         self._version, self.info = version, found
