@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import shutil
 from collections.abc import Callable, Collection, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +15,18 @@ from ..errors import CommandError
 from .codecs import key_frames
 from .dataset import Dataset, Episode, KeptRows
 from .index import checked_name, dataset_errors
-from .layout import GRID, SETPOINT, STATE, TIMES, EpisodePlace, current_key, video_names
+from .layout import (
+    GRID,
+    SETPOINT,
+    STATE,
+    TIMES,
+    DatasetLayout,
+    EpisodePlace,
+    building_folder,
+    current_key,
+    put_in_place,
+    video_names,
+)
 from .merging import existing_episodes, extract, merge, open_dataset
 
 __all__ = ["KeptRows", "find_motion", "shares", "split", "trim"]
@@ -58,7 +67,8 @@ def split(dataset: str | Path | Dataset, parts: Mapping[str, Collection[int]], o
 
     Raises:
         CommandError: A part is empty or has no valid name, or an episode is in two (code ``bad_split``), or ``out``
-            exists (``output_exists``); otherwise as :func:`~hal.recording.extract`.
+            exists (``output_exists``), or another process splits into it (``dataset_locked``); otherwise as
+            :func:`~hal.recording.extract`.
         DatasetError: The dataset is damaged.
     """
     numbers = [number for part in parts.values() for number in set(part)]
@@ -72,14 +82,11 @@ def split(dataset: str | Path | Dataset, parts: Mapping[str, Collection[int]], o
     target = Path(out).expanduser().absolute()
     if target.exists():
         raise CommandError(f"{target} exists; choose a new folder", code="output_exists")
-    building = target.with_name(f".{target.name}.splitting-{os.getpid()}")
-    shutil.rmtree(building, ignore_errors=True)
     opened = open_dataset(dataset)
-    try:
-        counts = {name: extract(opened, part, building / name) for name, part in parts.items()}
-        building.rename(target)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+    with building_folder(DatasetLayout(target), "splitting") as building:
+        whole = building.root / "parts"
+        counts = {name: extract(opened, part, whole / name) for name, part in parts.items()}
+        put_in_place(whole, target, replaces=False)
     return counts
 
 

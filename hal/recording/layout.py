@@ -42,6 +42,7 @@ __all__ = [
     "TIMES",
     "VERSION",
     "VIDEO_MB",
+    "building_folder",
     "current_key",
     "features_of",
     "file_version",
@@ -430,6 +431,33 @@ def lock_dataset(layout: DatasetLayout, *, only_read: bool = False) -> Iterator[
         yield
     finally:
         os.close(fd)
+
+
+@contextlib.contextmanager
+def building_folder(target: DatasetLayout, what: str) -> Iterator[DatasetLayout]:
+    """Hold an empty hidden folder beside a place, to build there what comes into it. It is removed in the end.
+
+    What a killed program left in it is removed first.
+
+    Args:
+        target: The place.
+        what: What is done, for the folder's name.
+
+    Raises:
+        CommandError: Another process holds this folder (code ``dataset_locked``).
+    """
+    building = DatasetLayout(target.beside(what))
+    with lock_dataset(building):
+        try:
+            for path in (*building.root.iterdir(), *building.episodes.iterdir()):
+                if path.is_dir() and not path.is_symlink():
+                    if path != building.episodes:
+                        shutil.rmtree(path)
+                elif path.name != ".lock":
+                    path.unlink()
+            yield building
+        finally:
+            shutil.rmtree(building.root, ignore_errors=True)
 
 
 def _lock_now(layout: DatasetLayout, only_read: bool) -> int | None:

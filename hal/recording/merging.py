@@ -43,6 +43,7 @@ from .layout import (
     VIDEO_MB,
     DatasetLayout,
     EpisodePlace,
+    building_folder,
     finish_replacement,
     lock_dataset,
     put_in_place,
@@ -114,7 +115,6 @@ def merge(
     require_libraries()
     finish_replacement(out)
     target = DatasetLayout(Path(out).expanduser().resolve())  # not through a link: folders beside it are renamed
-    building = DatasetLayout(target.beside("merging"))
     folders = [part.root if isinstance(part, Dataset) else part for part in parts]
     layouts = [DatasetLayout(Path(folder).expanduser().resolve()) for folder in folders]
     replaces = target.root in [layout.root for layout in layouts]
@@ -147,27 +147,13 @@ def merge(
                     f"{part.root} has changed since it was opened; nothing was done", code="dataset_changed"
                 )
         sources = _sources(layouts, key, label or _label, view)
-        locks.enter_context(lock_dataset(building))  # another process may be merging into the same folder
-        try:
-            _clear(building)
-            _Builder(building, sources).build(on_episode)
-            if replaces:
-                _keep_other_files(target, building)
-            os.sync()  # the parts may be removed next
-            put_in_place(building.root, target.root, replaces=replaces)
-        finally:
-            shutil.rmtree(building.root, ignore_errors=True)
+        building = locks.enter_context(building_folder(target, "merging"))
+        _Builder(building, sources).build(on_episode)
+        if replaces:
+            _keep_other_files(target, building)
+        os.sync()  # the parts may be removed next
+        put_in_place(building.root, target.root, replaces=replaces)
     return len(sources)
-
-
-def _clear(building: DatasetLayout) -> None:
-    """Remove what a merge that was killed has left, but not the lock."""
-    for path in (*building.root.iterdir(), *building.episodes.iterdir()):
-        if path.is_dir() and not path.is_symlink():
-            if path != building.episodes:
-                shutil.rmtree(path)
-        elif path.name != ".lock":
-            path.unlink()
 
 
 def _keep_other_files(old: DatasetLayout, new: DatasetLayout) -> None:
