@@ -367,7 +367,8 @@ class RemotePolicy:
             if step[worst] > most[worst]:
                 raise PolicyError(
                     f"the policy's next chunk begins {step[worst]:.2f} rad away from the present one at "
-                    f"{robot.joints[worst]} of {name}; it may be {most[worst]:.2f} rad",
+                    f"{robot.joints[worst]} of {name}; it may be {most[worst]:.2f} rad: let the policy drive more "
+                    "slowly, lower 'execute', or use real-time chunking",
                     code="policy_jump",
                 )
         self._steep += steep
