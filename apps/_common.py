@@ -43,6 +43,7 @@ __all__ = [
     "robot_names",
     "run_app",
     "select_robots",
+    "typed_command",
 ]
 
 ACTION_NEEDED = 2
@@ -419,7 +420,7 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
     from hal.errors import HalError
 
     _open_standard_streams()
-    parser.prog = _typed(parser.prog)
+    parser.prog = typed_command(parser.prog)
     link = logging.getLogger("hal.console")
     before, link.disabled = link.disabled, True  # the banner prints the link
     try:
@@ -443,7 +444,7 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
         link.disabled = before
 
 
-def _typed(name: str) -> str:
+def typed_command(name: str) -> str:
     """Return the command that started the program ``name``: ``hal teleop``, ``hal-teleop`` or ``teleop.py``."""
     command, *rest = name.split()
     typed = Path(sys.argv[0]).name

@@ -14,7 +14,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app
+from hal.apps._common import run_app, typed_command
 from hal.errors import CommandError
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="EPISODES are numbers such as 0,3-5. Pictures and depth are never encoded again; a result replaces the "
         "dataset when it is complete. hal-review shows an episode.",
     )
-    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=typed_command("dataset"))
 
     def add(name: str, what: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=what, description=what[0].upper() + what[1:] + ".")

@@ -13,7 +13,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from hal.apps._common import run_app
+from hal.apps._common import run_app, typed_command
 
 __all__ = ["PROGRAMS", "main", "parser"]
 
@@ -83,7 +83,7 @@ def _main(args: argparse.Namespace) -> int:
 
 
 def _list(arguments: list[str]) -> int:
-    made = argparse.ArgumentParser(prog="hal list", description="List built-in models and rigs by name.")
+    made = argparse.ArgumentParser(prog=typed_command("hal list"), description="List built-in models and rigs by name.")
     made.add_argument("kinds", nargs="*", metavar="KIND", help=f"{', '.join(LISTS)} (all)")
     kinds = made.parse_args(arguments).kinds or list(LISTS)
     for kind in kinds:

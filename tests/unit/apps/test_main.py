@@ -10,7 +10,7 @@ import pytest
 from app_kit import run_here
 from engines_kit import AUTO
 
-from hal.apps import teleop
+from hal.apps import dataset, teleop
 from hal.apps.main import PROGRAMS, main
 
 if sys.version_info >= (3, 11):
@@ -43,8 +43,10 @@ def test_a_program_gets_its_own_options(name: str, capsys: pytest.CaptureFixture
         ("/usr/bin/hal", ["collect"], "hal collect"),
         ("/usr/bin/hal", ["import-ark"], "hal import-ark"),
         ("/usr/bin/hal", ["calibrate", "board"], "hal calibrate board"),
+        ("/usr/bin/hal", ["dataset", "split"], "hal dataset split"),
         ("/usr/bin/hal", [], "hal"),
         ("apps/main.py", ["review"], "main.py review"),
+        ("apps/main.py", ["list"], "main.py list"),
     ],
 )
 def test_usage_names_the_command_that_was_typed(
@@ -58,6 +60,12 @@ def test_usage_names_the_command_that_was_typed(
 def test_usage_of_a_single_program(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", [f"/somewhere/{command}"])
     assert run_here(teleop.main, "--help").stdout.startswith(f"usage: {command} [-h]")
+
+
+@pytest.mark.parametrize("command", ["hal-dataset", "dataset.py"])
+def test_usage_of_a_subcommand(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{command}"])
+    assert run_here(dataset.main, "split", "--help").stdout.startswith(f"usage: {command} split [-h]")
 
 
 def test_it_runs_a_program() -> None:
