@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arguments import number
 from ..camera import Camera
 from ..commands import FIRST_STEP_ANGLE, CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Twist
 from ..control import Control
@@ -342,10 +343,13 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             render_mode: None or ``rgb_array``.
 
         Raises:
-            CommandError: An argument is wrong.
-            NotSupported: The rig lacks a stream (code ``unknown_stream``) or a world (``no_world``).
+            CommandError: An argument is wrong, also one of the control session (see :meth:`hal.robot.Robot.control`).
+            NotSupported: The rig lacks a stream (code ``unknown_stream``) or a world (``no_world``); the arm takes no
+                controller.
             DriverMissing: gymnasium is not installed.
         """
+        from ..servo.controllers import Position
+
         if render_mode not in (None, "rgb_array"):
             raise NotSupported(
                 f"render_mode {render_mode!r}: use rgb_array, the first camera's picture", code="render_mode"
@@ -354,6 +358,11 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         for argument, names in (("cameras", cameras), ("streams", streams), ("objects", objects)):
             if isinstance(names, str):
                 raise CommandError(f"{argument} must be a list of names: [{names!r}]", code="not_a_list")
+        functions = {"reward": reward, "terminated": terminated, "on_reset": on_reset, "deadman": deadman}
+        for argument, function in functions.items():
+            if function is not None and not callable(function):
+                raise CommandError(f"{argument} must be a function, not {function!r}", code="not_callable")
+        rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
         self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
         self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
         self._unattended, self._controller = unattended, controller
@@ -375,6 +384,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
                 self._leads, chosen, self._streams, self._objects
             )
+            for arm in self._arms:  # checks the arguments of its session, and opens none
+                if self._session(arm).controller != Position() and action == "torque":
+                    raise CommandError("action='torque' takes no controller", code="torques_by_controller")
         except BaseException:
             self.rig.close()
             raise
@@ -454,10 +466,12 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
 
     def _open_sessions(self) -> None:
         for arm in self._arms:
-            control = arm.robot.control(
-                deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended, controller=self._controller
-            )
-            arm.control = control.__enter__()
+            arm.control = self._session(arm).__enter__()
+
+    def _session(self, arm: _EnvArm) -> Control:
+        return arm.robot.control(
+            deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended, controller=self._controller
+        )
 
     def _close_sessions(self) -> None:
         with ExitStack() as closing:  # each is closed, whatever happens to the others

@@ -343,6 +343,22 @@ def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
     for wrong in ({"action": "jump"}, {"robot": "pandda"}, {"cameras": ["wirst"]}):
         with pytest.raises(hal.HalError):
             RigEnv("panda_table", driver="mock", **wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code"),
+    [
+        ({"rate_hz": 0.0}, "bad_command"),
+        ({"rate_hz": 0.5}, "rate_too_low"),
+        ({"reward": 1.0}, "not_callable"),
+        ({"controller": "impedance"}, "bad_controller"),
+        ({"controller": hal.JointImpedance(stiffness=[1.0])}, "bad_controller"),
+        ({"controller": hal.JointImpedance(), "action": "torque"}, "torques_by_controller"),
+    ],
+)
+def test_arguments_of_later_calls_are_checked_at_once(wrong: dict[str, object], code: str) -> None:
+    with raises_code(hal.CommandError, code):
+        RigEnv("panda_table", driver="mock", overrides=BARE, **wrong)
     env = RigEnv("panda_table", driver="mock", overrides=BARE)
     try:
         with raises_code(hal.CommandError, "not_reset"):
