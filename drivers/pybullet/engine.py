@@ -209,6 +209,8 @@ class Body(SimulatedBody):
     """Whether the fingers move or hold something."""
     edits: int = 0
     """Number of changes of masses, of the base's place, and of gravity."""
+    reloads: int = 0
+    """How often it was loaded again, which takes away what was applied to its joints for the coming step."""
     hardened: set[int] = field(default_factory=set)
     """Links whose contacts were made soft and then hard again (see :mod:`.dynamics`)."""
 

@@ -201,6 +201,8 @@ class JointTorques:
         self._v0 = self._mass = self._bias = np.zeros(0)
         """Of the present step: speeds at its start (n,), inertia (n, n), and gravity and Coriolis torques (n,)."""
         self._driving = False
+        self._reloads = body.reloads
+        """That of the body to which the torques were added."""
 
     def take_over(self) -> None:
         """Switch the joints' own motors off, and start to apply torques."""
@@ -279,6 +281,7 @@ class JointTorques:
         client = self._client
         client.setJointMotorControlArray(self._body.id, self._joints, client.TORQUE_CONTROL, forces=more)
         self._sum = [a + b for a, b in zip(self._sum, more, strict=True)]
+        self._reloads = self._body.reloads
 
     def save(self) -> dict[str, Floats]:
         """Return the torques of the coming step, which are no part of PyBullet's states."""
@@ -286,9 +289,10 @@ class JointTorques:
         return {name: list(part) for name, part in parts.items()} | {"external": self._external.tolist()}
 
     def withdraw(self) -> None:
-        """Withdraw what was applied to the coming step."""
-        self._add([-part for part in self._sum])
-        self._applied = self._sum
+        """Withdraw what was applied to the coming step; a body that was loaded again has nothing of it."""
+        if self._reloads == self._body.reloads:
+            self._add([-part for part in self._sum])
+        self._applied = self._sum = [0.0] * len(self._joints)
 
     def restore(self, state: Mapping[str, Floats]) -> None:
         """Apply the torques of :meth:`save` to the coming step, to which nothing is applied yet."""

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from engines_kit import Engine, need_engine
 from errors_kit import raises_code
-from specs import PANDA_HOME, box, cube, floor, panda
+from specs import PANDA_HOME, box, cube, floor, iiwa, panda
 
 import hal
 from hal.driver import Setpoint
@@ -248,3 +248,29 @@ def test_an_arm_whose_numbers_mean_nothing_reports_a_fault_until_the_world_is_re
     bench.world.restore(state)
     assert bench.world.snapshot() == pytest.approx(before, abs=1e-9)
     bench.world.close()
+
+
+@pytest.mark.parametrize("how", ["reset", "restore"])
+def test_torques_of_an_unstable_simulation_do_not_act_after_a_reset(how: str) -> None:
+    """Its numbers are NaN: the damping of the iiwa's joints is computed from their speeds."""
+    engine = need_engine("pybullet")
+    world = engine.world(iiwa())
+    robot = engine.robot(world)
+    robot.open()
+    still = [0.0] * 7
+    q = robot.read(0.0).q
+    robot.write(Setpoint(q, still, still, still))
+    world.step()
+    state = world.save()
+    world.client.resetJointState(world.body("iiwa").id, 3, 0.0, 1e200)
+    robot.write(Setpoint(q, still, still, still))
+    world.step()
+    assert robot.read(0.0).fault is not None
+    world.reset() if how == "reset" else world.restore(state)
+    for _ in range(5):
+        world.step()
+        reading = robot.read(0.0)
+        assert reading.fault is None
+        assert np.abs(reading.dq).max() < 0.01
+    assert reading.q == pytest.approx(q, abs=1e-4)
+    world.close()
