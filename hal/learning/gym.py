@@ -384,8 +384,12 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
                 self._leads, chosen, self._streams, self._objects
             )
-            for arm in self._arms:  # checks the arguments of its session, and opens none
-                if self._session(arm).controller != Position() and action == "torque":
+            free = (
+                unattended or self._deadman is not None
+            )  # whether its pad can be trusted is checked at the reset: it may be asleep
+            for arm in chosen_robots:  # checks the arguments of its session, and opens none
+                checked = arm.control(rate_hz=rate_hz, unattended=free, controller=controller)
+                if checked.controller != Position() and action == "torque":
                     raise CommandError("action='torque' takes no controller", code="torques_by_controller")
         except BaseException:
             self.rig.close()
@@ -466,12 +470,10 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
 
     def _open_sessions(self) -> None:
         for arm in self._arms:
-            arm.control = self._session(arm).__enter__()
-
-    def _session(self, arm: _EnvArm) -> Control:
-        return arm.robot.control(
-            deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended, controller=self._controller
-        )
+            control = arm.robot.control(
+                deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended, controller=self._controller
+            )
+            arm.control = control.__enter__()
 
     def _close_sessions(self) -> None:
         with ExitStack() as closing:  # each is closed, whatever happens to the others
