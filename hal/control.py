@@ -415,6 +415,8 @@ class Control:
         if servo.trip is Trip.COMMAND_LATE:
             longest = f"at most {1e3 * self._deadline:.0f} ms may pass between two at rate_hz={self._rate_hz:g}"
             return f" ({longest}; for a slower loop pass a lower rate_hz, or send chunks)"
+        if servo.trip is Trip.LIMIT and servo.overrun:
+            return f" (here: {servo.overrun})"
         state = self._mail.get_state() if servo.status is RobotStatus.LOST else None
         return f" ({state.fault.cause})" if state is not None and state.fault is not None else ""
 

@@ -142,7 +142,8 @@ class Trip(_Named):
     HOST_LATE = 9
     """The process of the servo was stopped, or could not run, for too long."""
     LIMIT = 10
-    """In torque mode the arm reached a limit: of speed, of position, of the workspace, or of the time to brake."""
+    """In torque mode the arm reached a limit: of speed, of position, of the workspace, of the distance to something, or
+    of the time to brake."""
 
     @property
     def code(self) -> str:
@@ -168,7 +169,8 @@ _TRIPS = {
     Trip.HOST_LATE: ("host_late", "the servo's process was stopped, or could not run, for too long"),
     Trip.LIMIT: (
         "torque_limit",
-        "in torque mode the arm reached a limit of speed, position or workspace, or did not come to rest",
+        "in torque mode the arm reached a limit of speed, position or workspace, came too near to something, or did "
+        "not come to rest",
     ),
 }
 

@@ -295,6 +295,7 @@ class ArmUnit:
             report.held_back,
             report.progress,
             report.off_path,
+            report.overrun,
         )
         self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
 

@@ -72,7 +72,7 @@ def fault_at(record: bytes, offset: int) -> Fault | None:
 
 
 _STAMP = struct.Struct("<ddQ")
-_SERVO = struct.Struct("<iiiQQ?Qddiid?")
+_SERVO = struct.Struct("<iiiQQ?Qddiid?i")
 _CONTROLLERS = {int(mode): mode for mode in ControlMode}
 _STATUSES = {int(status): status for status in RobotStatus}
 _TRIPS = {int(trip): trip for trip in Trip}
@@ -104,6 +104,8 @@ class ServoRecord(NamedTuple):
     """Share of that motion that is done, from 0 to 1."""
     off_path: bool = False
     """Whether the arm cannot continue on the path of that motion: it was moved too far off, or no plan leads on."""
+    overrun: Limited = Limited.NONE
+    """Limit that the arm reached when ``Trip.LIMIT`` was latched; ``NONE`` if it could not be braked."""
 
 
 class StateLayout:
@@ -164,23 +166,24 @@ class StateLayout:
             servo.held_back,
             servo.progress,
             servo.off_path,
+            servo.overrun,
             *fault_values(reading.fault),
         )
 
     def servo(self, record: bytes) -> ServoRecord:
         """Return the servo's part of a record."""
-        *rest, controller, held_back, progress, off_path = _SERVO.unpack_from(record, self._servo_at)
+        *rest, controller, held_back, progress, off_path, overrun = _SERVO.unpack_from(record, self._servo_at)
         sets = self._set_points.unpack_from(record, self._set_at)
         status, trip, limited, *rest = rest
         n, first = self.n, (_STATUSES[status], _TRIPS[trip], _limited(limited))
-        motion = (_limited(held_back), progress, off_path)
+        motion = (_limited(held_back), progress, off_path, _limited(overrun))
         return ServoRecord._make((*first, *rest, sets[:n], sets[n:], _CONTROLLERS[controller], (), *motion))
 
     def state(self, record: bytes) -> RobotState:
         """Return the whole state in a record."""
         n, end = self.n, self._servo_at
         numbers: NDArray[np.float64] = np.frombuffer(record, "<f8", self._count, _STAMP.size)
-        status, trip, limited, target_seq, *_, controller, _, _, _ = _SERVO.unpack_from(record, end)
+        status, trip, limited, target_seq, *_, controller, _, _, _, _ = _SERVO.unpack_from(record, end)
         tau = numbers[2 * n : 3 * n]
         rest = numbers[5 * n :]
         tau_ext, wrench_ext, tau_set = rest[20 : 20 + n], rest[20 + n : 26 + n], rest[26 + n :]

@@ -65,6 +65,8 @@ class ServoReport:
     """Limits by which the servo reduced the motion of the session, since it was opened."""
     off_path: bool = False
     """Whether the arm cannot continue on the path of its session: it was moved too far off, or no plan leads on."""
+    overrun: Limited = Limited.NONE
+    """Limit that the arm reached when ``Trip.LIMIT`` was latched; ``NONE`` if it could not be braked."""
     t_trip: float = 0.0
     """Time at which the stop was latched, s."""
     t_stop: float = 0.0
@@ -402,13 +404,13 @@ class Servo:
 
     def _overruns(self) -> Trip:
         """Return ``Trip.LIMIT`` if an arm that follows torques, or is braked by them, runs into a limit."""
-        if self._compliance.active:
-            limit = self._compliance.strays()
-        else:
-            limit = self._torque.overrun(driven=self._motion is self._torque)
+        driven = self._compliance.active or self._motion is self._torque
+        limit = self._compliance.strays() if self._compliance.active else self._torque.overrun(driven)
         if limit is None:
             return _NO_TRIP
         self._envelope.limited |= limit
+        if self._watchdog.trip is _NO_TRIP:
+            self.report.overrun = limit if driven else Limited.NONE
         if limit is Limited.COLLISION:
             self._leave_torques()  # what pushes it would push it on while torques brake it
         return Trip.LIMIT

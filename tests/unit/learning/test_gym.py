@@ -176,6 +176,19 @@ def test_joints_move_by_velocities_with_a_controller_or_by_bare_torques(
         env.close()
 
 
+def test_a_stop_at_a_limit_names_the_limit() -> None:
+    env = RigEnv("panda_table", driver="mock", action="torque", overrides=BARE)
+    try:
+        env.reset()
+        for _ in range(100):
+            _, _, _, truncated, info = env.step(np.array([0.0] * 6 + [12.0, 0.0], np.float32))
+            if truncated:
+                break
+        assert info["stopped"].endswith("(here: position)")
+    finally:
+        env.close()
+
+
 RANGES = "objects.3={file: duck, random: {x: [0.2, 0.3], y: [-0.3, 0.3], yaw_deg: [-180, 180]}}"
 
 

@@ -281,7 +281,7 @@ class TestGuards:
             if arm.servo.report.trip:
                 break
         assert arm.servo.report.trip is Trip.LIMIT
-        assert arm.limited & Limited.POSITION
+        assert arm.servo.report.overrun is Limited.POSITION
         arm.until_held()
         assert (arm.q <= limits.upper).all()
         assert (arm.q >= limits.lower).all()
@@ -299,7 +299,7 @@ class TestGuards:
             if arm.servo.report.trip:
                 break
         assert arm.servo.report.trip is Trip.LIMIT
-        assert arm.limited & Limited.WORKSPACE
+        assert arm.servo.report.overrun is Limited.WORKSPACE
         arm.until_held()
         assert 0.05 < arm.servo.kinematics.fk(arm.q)[1] <= 0.12
 
