@@ -65,7 +65,8 @@ class FrankaArm(RobotDriver):
         """Whether the fault clears itself once the robot is ready again, and whether it has been reported."""
         self._shown = _NOT_SHOWN
         """Last mode that was interpreted, and its fault."""
-        self._dynamics: Dynamics | None = None
+        self._dynamics = _dynamics(spec)
+        """Read here: with large meshes that takes longer than the arm waits for a set-point."""
         self.success_min = inf
         """Lowest success rate so far."""
         self._t_received = 0.0
@@ -179,14 +180,6 @@ class FrankaArm(RobotDriver):
         For a URDF without the published inertials it is that of an FR3 with its hand: every Franka arm has the same
         lengths and nearly the same masses.
         """
-        if self._dynamics is None:
-            try:
-                self._dynamics = Dynamics.of(self.spec)
-            except NotSupported:
-                joints = tuple(f"fr3_joint{k}" for k in range(1, 8))
-                urdf = str(find_data("robots", "fr3.urdf"))
-                spec = replace(self.spec.kinematics, urdf=urdf, joints=joints, base_link=None, tcp_link="fr3_hand")
-                self._dynamics = Dynamics(spec)
         return self._dynamics.mass_matrix(q)
 
     def halt(self) -> None:
@@ -309,6 +302,16 @@ class FrankaArm(RobotDriver):
             "aborts": self.aborts,
             "reconnects": self._connection.reconnects,
         }
+
+
+def _dynamics(spec: RobotSpec) -> Dynamics:
+    """Return the dynamics of an arm; those of an FR3 with its hand where the URDF is without sound inertials."""
+    try:
+        return Dynamics.of(spec)
+    except NotSupported:
+        joints = tuple(f"fr3_joint{k}" for k in range(1, 8))
+        urdf = str(find_data("robots", "fr3.urdf"))
+        return Dynamics(replace(spec.kinematics, urdf=urdf, joints=joints, base_link=None, tcp_link="fr3_hand"))
 
 
 def create_link(arm: str) -> ArmLink:

@@ -212,6 +212,16 @@ def test_driver_and_emulator_have_the_inertia_of_the_urdf(model: str) -> None:
         assert np.array(other) == pytest.approx(np.array(dynamics.mass_matrix(spec.home)), abs=0.15)
 
 
+def test_the_driver_reads_the_inertia_before_its_first_cycle(tmp_path: Path) -> None:
+    spec = fr3(sim=False)
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_bytes(Path(spec.urdf).read_bytes())
+    spec = replace(spec, urdf=str(urdf), kinematics=replace(spec.kinematics, urdf=str(urdf)))
+    driver = FrankaArm(spec)
+    urdf.unlink()
+    assert np.shape(driver.mass_matrix(spec.home)) == (7, 7)
+
+
 def test_every_speed_holds_everywhere_in_the_range() -> None:
     limits = fr3(sim=False).limits
     assert FR3.rectangle is not None
