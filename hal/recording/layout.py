@@ -360,9 +360,33 @@ def finish_replacement(out: str | Path) -> None:
     Everything that opens or makes a dataset calls it first: a new one in this place would hide the old one.
     """
     target = DatasetLayout(Path(out).expanduser().resolve())
-    replaced = target.beside("replaced")
-    if replaced.is_dir() and not target.root.exists():
-        replaced.rename(target.root)
+    if not _is_hidden(target):
+        return
+    if not target.root.exists():
+        target.beside("replaced").rename(target.root)
+        return
+    with contextlib.suppress(OSError):  # the folder is in use, or no longer empty
+        fd = _lock_file(target)
+        if fd is not None:
+            try:
+                (target.episodes / ".lock").unlink()
+                target.episodes.rmdir()
+                target.beside("replaced").rename(target.root)
+            finally:
+                os.close(fd)
+
+
+def _is_hidden(target: DatasetLayout) -> bool:
+    """Return whether a dataset that was being replaced waits beside its place, and no other one is in this place.
+
+    A folder with no more than a lock is no dataset: a program that waits for the lock makes it between two steps.
+    """
+    own = {str(target.episodes), str(target.episodes / ".lock")}
+    return target.beside("replaced").is_dir() and all(
+        os.path.join(folder, name) in own
+        for folder, folders, files in os.walk(target.root)
+        for name in (*folders, *files)
+    )
 
 
 def put_in_place(building: Path, target: Path, *, replaces: bool) -> None:
@@ -385,7 +409,7 @@ def put_in_place(building: Path, target: Path, *, replaces: bool) -> None:
             building.rename(target)
         except OSError:
             with contextlib.suppress(OSError):
-                replaced.rename(target)
+                finish_replacement(target)
             raise
         replaced.rename(building)
     sync_to_disk(target.parent)
@@ -466,6 +490,15 @@ def _lock_now(layout: DatasetLayout, only_read: bool) -> int | None:
     None if another process holds it, or has put another dataset in this place since the file was opened.
     """
     finish_replacement(layout.root)
+    fd = _lock_file(layout, only_read)
+    if fd is not None and _is_hidden(DatasetLayout(layout.root.resolve())):
+        os.close(fd)  # made here between two steps of a replacement
+        return None
+    return fd
+
+
+def _lock_file(layout: DatasetLayout, only_read: bool = False) -> int | None:
+    """Return the open lock file of the folder that is in a dataset's place now; None as :func:`_lock_now`."""
     layout.episodes.mkdir(parents=True, exist_ok=True)
     if layout.episodes.is_symlink():
         raise CommandError(f"{layout.episodes} is a link; nothing is recorded through it", code="dataset_link")

@@ -279,6 +279,40 @@ def test_a_dataset_survives_a_kill_while_it_is_replaced(
     assert {path.name for path in tmp_path.iterdir()} <= {"demo", "old"}
 
 
+@pytest.mark.parametrize("then", ["the merge goes on", "it is killed", "it is killed, and the lock held"])
+def test_a_folder_made_by_a_waiting_program_does_not_hide_the_dataset(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, then: str
+) -> None:
+    demo, rename = Path(shutil.copytree(part, tmp_path / "demo")), Path.rename
+
+    def another_waits(self: Path, target: Path) -> Path:
+        if self.name == ".demo.merging":
+            os.close(layout_module._lock_file(DatasetLayout(demo)) or -1)
+            if then != "the merge goes on":
+                raise KeyboardInterrupt
+        return rename(self, target)
+
+    with monkeypatch.context() as patched, pytest.raises((OSError, KeyboardInterrupt)):
+        patched.setattr(Path, "rename", another_waits)
+        patched.setattr(layout_module, "_exchange", lambda *_: False)
+        pack(demo)
+    assert (demo / "meta").exists() is (then == "the merge goes on")
+    monkeypatch.setattr(layout_module, "_PATIENCE", 0.0)
+    if then == "it is killed, and the lock held":
+        held = layout_module._lock_file(DatasetLayout(demo))
+        assert held is not None
+        with raises_code(CommandError, "dataset_locked"), lock_dataset(DatasetLayout(demo)):
+            pass
+        os.close(held)
+    elif then == "it is killed":  # the other program, which has looked for a hidden dataset before, gets the lock
+        with monkeypatch.context() as patched, raises_code(CommandError, "dataset_locked"):
+            patched.setattr(layout_module, "finish_replacement", lambda _: None)
+            with lock_dataset(DatasetLayout(demo)):
+                pass
+    assert len(Dataset(demo)) == pack(demo) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["demo"]
+
+
 def test_a_reader_follows_joined_files_and_refuses_another_episode(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
