@@ -63,7 +63,16 @@ def list_devices(plan: Plan) -> list[str]:
         bodies = ", ".join(body.name for body in plan.world.bodies) or "empty"
         lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {bodies}")
     lines.append(f"clock    {plan.clock.replace('_', ' ')}")
+    lines += [f"missing  {library}: {command}" for library, command in _missing_libraries(plan).items()]
     return lines
+
+
+def _missing_libraries(plan: Plan) -> dict[str, str]:
+    """Return the libraries of arms and grippers that are not installed -> the command that installs each."""
+    from hal import registry
+
+    devices = [device for robot in plan.robots for device in (robot, robot.gripper) if device is not None]
+    return {name: command for device in devices for name, command in registry.missing(device.driver, device).items()}
 
 
 def _pad(pad: PadSpec) -> str:

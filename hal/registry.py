@@ -143,6 +143,9 @@ class DriverSpec:
     """Whether ``hal.open(driver=...)`` may put this driver in place of every device, in lock-step."""
     requires: Mapping[str, str] = field(default_factory=dict)
     """Import name of each library that the driver needs -> command that installs it."""
+    libraries: str | None = None
+    """"module:function" of a real device's record, which returns those of :attr:`requires` that this device needs; None
+    if every device needs all."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -311,16 +314,19 @@ def checked(name: str, kind: str, record: object) -> list[tuple[str, str, str]]:
     return [(key, message, *(code or ("invalid",))) for key, message, *code in check(record)] if check else []
 
 
-def missing(name: str) -> dict[str, str]:
+def missing(name: str, device: object = None) -> dict[str, str]:
     """Return the libraries that a driver needs and that are not installed -> the command that installs each.
 
     Imports none of them, so a program can report what is missing before it opens anything.
+
+    Args:
+        name: The driver.
+        device: Record of a device, to name only what this one needs.
     """
-    return {
-        library: command
-        for library, command in driver(name).requires.items()
-        if importlib.util.find_spec(library) is None
-    }
+    spec = driver(name)
+    choose = None if device is None else function(name, spec.libraries)
+    needed = spec.requires if choose is None else choose(device)
+    return {library: spec.requires[library] for library in needed if importlib.util.find_spec(library) is None}
 
 
 def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:

@@ -18,6 +18,7 @@ DRIVER = DriverSpec(
     preflight="hal.drivers.franka.preflight:check",
     own_process=frozenset({"gripper"}),
     shared_options=("host",),
+    libraries="hal.drivers.franka.settings:libraries",
     requires={
         "pylibfranka": "pip install 'robot-hal[franka]' (Python 3.10 to 3.12; there is no wheel for newer ones)",
         "panda_py": "pip install 'robot-hal[panda]'",

@@ -231,6 +231,11 @@ def is_emulated(options: Mapping[str, Any]) -> bool:
         return host == "localhost"
 
 
+def libraries(spec: RobotSpec | GripperSpec) -> tuple[str, ...]:
+    """Return the library that a device needs: the Franka Hand that of the Panda, on an FR3 too."""
+    return ("pylibfranka",) if spec.options.get("arm") == "fr3" else ("panda_py",)
+
+
 def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
     """Yield the problems in an arm's record: key in the arm's entry of the rig file, message and code."""
     yield from _check_options(ArmSettings, spec.options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -95,3 +96,23 @@ def test_what_is_in_order_passes(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert dry_run(tmp_path, WITH_PAD, *options) == 0
     assert "is valid" in capsys.readouterr().out
     assert not (tmp_path / "run.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("model", "library", "other"), [("fr3", "pylibfranka", "panda_py"), ("panda", "panda_py", "pylibfranka")]
+)
+def test_a_missing_library_of_an_arm_is_listed(
+    model: str,
+    library: str,
+    other: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, "pylibfranka", None)
+    monkeypatch.setitem(sys.modules, "panda_py", None)
+    real = f"robots: {{arm: {{model: {model}, sim: false, real: {{host: 172.16.0.2}}, gripper: {{enabled: false}}}}}}\n"
+    assert dry_run(tmp_path, real, "--pad", "web") == 0
+    output = capsys.readouterr().out
+    assert f"missing  {library}: pip install" in output
+    assert other not in output
