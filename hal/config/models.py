@@ -165,9 +165,16 @@ class GripperModel(Strict):
             raise ValueProblem("open and closed of a joint must differ", "empty_range")
         if self.widths and not any(given):
             raise ValueProblem("joints need open and closed where widths are given", "missing_key")
+        if self.widths and self._turned():
+            raise ValueProblem("widths grow where the first joint goes from open to closed", "wrong_order")
         if self.widths and max(width for _, width in self.widths) < self.width_max:
             raise ValueProblem(f"widths end below width_max, {self.width_max:g} m", "out_of_range")
         return self
+
+    def _turned(self) -> bool:
+        """Return whether the widths are those of a joint whose ends are the other way round."""
+        first, (near, less), (far, more) = self.joints[0], self.widths[0], self.widths[-1]
+        return (first.open - first.closed) * (far - near) * (more - less) < 0.0  # type: ignore[operator]  # both given
 
 
 class ToolModel(Strict):

@@ -134,6 +134,7 @@ def test_it_opens_closes_and_holds(engine: Engine, tmp_path: Path, make: Callabl
         ({"widths": [[0, 0.08]]}, "wrong_count"),
         ({"widths": [[0, 0.08], [1, 0.09], [2, 0]]}, "wrong_order"),
         ({"widths": [[0, 0.07], [1, 0]]}, "out_of_range"),
+        ({"widths": [[0, 0], [1, 0.08]]}, "wrong_order"),
     ],
 )
 def test_what_is_wrong_with_it(tmp_path: Path, change: dict[str, Any], code: str) -> None:
