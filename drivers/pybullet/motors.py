@@ -190,6 +190,8 @@ class JointTorques:
         self._positions = np.zeros(0)
         """Of all joints of the body, at the start of the present step."""
         self._gravity: Floats = ()
+        self._weighed = -1
+        """Number of the body's edits that the gravity and the inertia of the present step have."""
         self._applied: Floats = [0.0] * len(self._joints)
         """Torques of the coming step, Nm."""
         self._sum: Floats = self._applied
@@ -240,13 +242,10 @@ class JointTorques:
         self._model.update()
         q, dq = self._state()
         self._positions = q
-        self._gravity = self._model.gravity(q)[self._places].tolist()
-        if self._damping is not None:
-            speeds = dq[self._places]
-            if len(self._v0):
-                expected = np.array(self._sum) - self._bias
-                self._external = self._mass @ (speeds - self._v0) / self._dt - expected
-            self._weigh(q, dq)
+        if len(self._v0):
+            expected = np.array(self._sum) - self._bias
+            self._external = self._mass @ (dq[self._places] - self._v0) / self._dt - expected
+        self._weigh(q, dq)
         self.last_applied, self._applied = self._applied, [0.0] * len(self._joints)
         self._sum = self._applied
 
@@ -255,12 +254,18 @@ class JointTorques:
         return np.array(q), np.array(dq)
 
     def _weigh(self, q: Array, dq: Array) -> None:
-        self._v0 = dq[self._places]
-        self._mass = self._model.inertia(q)[self._block]
-        self._bias = self._model.bias(q, dq)[self._places]
+        self._weighed = self._body.edits
+        self._gravity = self._model.gravity(q)[self._places].tolist()
+        if self._damping is not None:
+            self._v0 = dq[self._places]
+            self._mass = self._model.inertia(q)[self._block]
+            self._bias = self._model.bias(q, dq)[self._places]
 
     def apply(self, tau: Floats) -> None:
         """Apply torques (Nm) plus the compensation, within the efforts, to the next step."""
+        if self._weighed != self._body.edits:
+            self._model.update()
+            self._weigh(*self._state())
         wanted = [
             max(-effort, min(effort, own + held))
             for own, held, effort in zip(tau, self._gravity, self._efforts, strict=True)
@@ -298,12 +303,11 @@ class JointTorques:
         """Apply the torques of :meth:`save` to the coming step, to which nothing is applied yet."""
         self._sum = [0.0] * len(self._joints)
         self._add(state["sum"])
-        self._applied, self._gravity = state["applied"], state["gravity"]
-        self._external = np.array(state["external"])
         self._model.update()
         self._positions, dq = self._state()
-        if self._damping is not None:
-            self._weigh(self._positions, dq)
+        self._weigh(self._positions, dq)
+        self._applied, self._gravity = state["applied"], state["gravity"]
+        self._external = np.array(state["external"])
 
     def mass_matrix(self, q: Floats) -> Array:
         """Return the inertia matrix (n, n) at ``q`` (n,) rad, kg m2; the body's other joints keep their positions."""

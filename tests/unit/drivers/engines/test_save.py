@@ -193,6 +193,18 @@ def test_a_state_with_wrong_parts_is_refused_and_changes_nothing(bench: Simulate
     assert world.snapshot() == before
 
 
+def test_a_state_does_not_loosen_the_limits_of_an_arm() -> None:
+    world = need_engine("mujoco").world(panda())
+    arm = world.motors.arms["panda"]
+    efforts, speeds = world.motors.efforts[arm].copy(), world.motors.speeds[arm].copy()
+    state = world.save()
+    rows, *limits = state["state"]["motors"]
+    state["state"]["motors"] = [rows, *([1e6] * len(row) for row in limits)]
+    world.restore(state)
+    assert np.array_equal(world.motors.efforts[arm], efforts)
+    assert np.array_equal(world.motors.speeds[arm], speeds)
+
+
 def test_a_state_reaches_the_bodies_of_its_names_or_is_refused(engine: Engine) -> None:
     places = {"one": (0.5, 0.0, 0.5), "two": (0.5, 0.3, 0.5), "three": (0.5, -0.3, 0.5)}
     boxes = {name: box(name, place, (0.02, 0.02, 0.02), mass=0.1) for name, place in places.items()}

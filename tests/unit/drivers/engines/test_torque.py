@@ -231,6 +231,17 @@ class TestDriver:
             world.step()
         assert driver.read(0.0).dq[6] == pytest.approx(1.0, rel=0.02)
 
+    def test_an_arm_on_a_wall_is_carried_in_any_gravity(self, engine: Engine) -> None:
+        world = engine.world(panda(base_orientation=(0.0, 0.5**0.5, 0.0, 0.5**0.5)))
+        driver = engine.robot(world)
+        driver.open()
+        for gravity in ((0.0, 0.0, -9.81), (3.0, 5.0, -4.0)):
+            world.set_gravity(gravity)
+            for _ in range(60):
+                driver.write(torques(driver))
+                world.step()
+            assert driver.read(0.0).q == pytest.approx(PANDA_HOME, abs=2e-3)
+
     def test_reading_twice_does_not_carry_it_twice(self, engine: Engine) -> None:
         world, driver = opened(engine)
         for _ in range(240):
