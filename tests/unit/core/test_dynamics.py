@@ -90,6 +90,10 @@ def test_a_payload_hangs_at_its_place_in_the_frame_of_the_tcp(tmp_path: Path) ->
 def test_gravity_points_down_however_the_base_is_mounted(tmp_path: Path) -> None:
     lying = replace(arm(tmp_path), base_orientation=TURNED)
     assert Dynamics.of(lying).gravity((0.3, 0.5)) == pytest.approx([0.0, 0.0], abs=1e-12)
+    hanging = replace(lying, base_orientation=(0.0, TURNED[0], 0.0, TURNED[3]))  # its x axis points down
+    expected = Dynamics(hanging.kinematics, gravity=(G, 0.0, 0.0)).gravity((0.3, 0.5))
+    assert Dynamics.of(hanging).gravity((0.3, 0.5)) == pytest.approx(expected)
+    assert np.abs(expected).min() > 1.0
 
 
 def test_inverse_dynamics_are_inertia_times_acceleration_plus_gravity(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 from collections.abc import Sequence
@@ -87,11 +88,28 @@ def test_an_arm_that_begins_inside_the_margin_may_leave_it(panda: RobotSpec, col
         collisions.check_motion([inside, inside + [0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0]])
 
 
-@pytest.mark.parametrize("models", [("panda",), ("iiwa", "panda")], ids="+".join)
-def test_bounds_never_exceed_distances(models: Sequence[str]) -> None:
+def slides(folder: Path) -> str:
+    """Return the model of an arm whose first joint turns what its second one slides far out."""
+    box = "<collision><geometry><box size='0.1 0.1 0.1'/></geometry></collision>"
+    joint = (
+        "<joint name='{0}' type='{1}'><parent link='{2}'/><child link='{3}'/><axis xyz='{4}'/>"
+        "<limit lower='-1.5' upper='1.5' effort='9' velocity='1'/></joint>"
+    )
+    links = "".join(f"<link name='{name}'>{box}</link>" for name in ("base", "turned", "tip"))
+    joints = joint.format("turn", "revolute", "base", "turned", "0 0 1")
+    joints += joint.format("slide", "prismatic", "turned", "tip", "1 0 0")
+    (folder / "slides.urdf").write_text(f"<robot name='slides'>{links}{joints}</robot>")
+    model = {"urdf": "slides.urdf", "joints": ["turn", "slide"], "tcp": {"link": "tip"}, "home": [0, 1]}
+    file = folder / "slides.yaml"
+    file.write_text(json.dumps(model | {"limits": {"acceleration": 1, "jerk": 1}}))
+    return str(file)
+
+
+@pytest.mark.parametrize("models", [("panda",), ("iiwa", "panda"), ("slides",)], ids="+".join)
+def test_bounds_never_exceed_distances(models: Sequence[str], tmp_path: Path) -> None:
     if "iiwa" in models:
         pytest.importorskip("pybullet_data", reason="needs pybullet_data (pip install pybullet)")
-    robots = arms(*models, apart=0.7)
+    robots = arms(*(slides(tmp_path) if model == "slides" else model for model in models), apart=0.7)
     model = CollisionModel(robots, CollisionSpec(boxes=(TABLE,)))
     lower = np.concatenate([r.limits.lower for r in robots])
     upper = np.concatenate([r.limits.upper for r in robots])

@@ -25,7 +25,8 @@ TOOL = f"""<robot name="tool"><link name="base_link"/><link name="left">{MASS}</
   <joint name="other" type="prismatic"><parent link="base_link"/><child link="right"/><axis xyz="0 1 0"/>{LIMIT}
     <mimic joint="turn" multiplier="-1"/></joint>
 </robot>"""
-POSE = Pose((0.1, 0.2, 0.3), (0.5, 0.5, 0.5, 0.5))
+POSES = [Pose((0.1, 0.2, 0.3), turn) for turn in ((0.2, -0.4, 0.6, 0.66), (0.5, 0.5, -0.5, 0.5), (0.5, -0.5, 0.5, 0.5))]
+"""In general, and with the y axis turned by 90 degrees to either side."""
 
 
 @pytest.fixture
@@ -38,15 +39,16 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_tool_is_mounted_and_renamed_where_the_arm_has_its_names(files: Path) -> None:
-    tool = MountedTool(files / "tool" / "tool.urdf", "flange", POSE)
+@pytest.mark.parametrize("pose", POSES)
+def test_a_tool_is_mounted_and_renamed_where_the_arm_has_its_names(files: Path, pose: Pose) -> None:
+    tool = MountedTool(files / "tool" / "tool.urdf", "flange", pose)
     made = compose_urdf(files / "arm.urdf", tool)
     assert made == compose_urdf(files / "arm.urdf", tool), "the same contents have the same name"
     model = read_urdf(made)
     assert set(model.links) == {"base_link", "flange", "thumb", "tool_base_link", "left", "right"}
     assert set(model.joints) == {"turn", "bend", "tool_turn", "other", "tool_mount"}
     assert [mimic.of for mimic in model.mimics] == ["tool_turn"]
-    distance, angle = model.poses({})["tool_base_link"].distance(POSE)
+    distance, angle = model.poses({})["tool_base_link"].distance(pose)
     assert distance == pytest.approx(0.0, abs=1e-9)
     assert angle == pytest.approx(0.0, abs=1e-6)
     assert model.links["right"].mass == 0.01

@@ -10,7 +10,7 @@ from specs import world_spec
 
 from hal.drivers.scene.drawn import DrawnWorld
 from hal.errors import ConfigError
-from hal.kinematics.mesh_files import mesh_file, package_folder
+from hal.kinematics.mesh_files import hull_points, mesh_file, package_folder
 from hal.specs import BodySpec
 
 CUBE = """
@@ -90,3 +90,11 @@ def test_a_mesh_that_an_installed_package_lacks_is_a_problem(package: Path, tmp_
     (problem,) = caught.value.problems
     assert (problem.file, problem.code) == (str(tmp_path / "thing.urdf"), "missing_file")
     assert "package://lab_meshes/ball.obj" in problem.message
+
+
+def test_the_hull_of_a_mesh_that_was_changed_is_computed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    mesh = tmp_path / "cube.obj"
+    for top in (1.0, 1.0, 25.0):
+        mesh.write_text(CUBE.replace("v 0 0 1", f"v 0 0 {top}"))
+        assert hull_points(mesh)[:, 2].max() == top
