@@ -452,7 +452,7 @@ def _of_link(
     loose += [
         urdf.joints[joint.mimic.of] for joint in chain if joint.mimic is not None and joint.mimic.of in urdf.joints
     ]
-    frame = model.frames[model.getFrameId(anchor)]
+    frame = model.frames[model.getFrameId(anchor, pin.FrameType.BODY)]  # a joint may have the same name
     carried = int(frame.parentJoint) > 0
     if any(joint.movable for joint in chain) and not carried:
         return []  # of something else on the same base, such as a second arm
