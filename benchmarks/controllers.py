@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
+import json
 import socket
 import subprocess
 import sys
@@ -293,10 +294,10 @@ def steps(controller: Any, engine: str | None, seconds: float) -> tuple[float, f
 
 
 ROBOSUITE = """
-import sys, time, numpy as np, robosuite
-env = robosuite.make(
-    "Lift", robots="Panda", has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False, control_freq=20
-)
+import json, os, sys, time
+os.environ.setdefault("MUJOCO_GL", "egl")
+import numpy as np, robosuite
+env = robosuite.make("Lift", robots="Panda", has_renderer=False, control_freq=20, **json.loads(sys.argv[2]))
 env.reset()
 still = np.zeros_like(env.action_spec[0])
 env.step(still)
@@ -308,9 +309,16 @@ print(steps / (time.perf_counter() - start))
 """
 
 
-def steps_of_robosuite(python: str, seconds: float) -> float:
-    """Return the steps per second of robosuite's task Lift (500 Hz physics, 20 Hz policy, its default controller)."""
-    command = [python, "-c", ROBOSUITE, str(seconds)]
+def steps_of_robosuite(python: str, seconds: float, **options: Any) -> float:
+    """Return the steps per second of robosuite's task Lift (500 Hz physics, 20 Hz policy, its default controller).
+
+    Args:
+        python: Interpreter in whose environment robosuite is installed.
+        seconds: Time to step, s.
+        **options: Arguments of ``robosuite.make``; without any, nothing is drawn.
+    """
+    drawn = {"has_offscreen_renderer": False, "use_camera_obs": False} | options
+    command = [python, "-c", ROBOSUITE, str(seconds), json.dumps(drawn)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
     return float(done.stdout.split()[-1])
 

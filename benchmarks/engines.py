@@ -20,7 +20,6 @@ import argparse
 import io
 import itertools
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -36,6 +35,9 @@ from hal import registry
 from hal.config.data_files import find_data
 from hal.geometry import Pose
 from hal.learning.gym import RigEnv
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from controllers import steps_of_robosuite
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from referee_kit import TOUR, draw_state, drive_tour
@@ -150,24 +152,14 @@ def speed(seconds: float) -> None:
     step_in_turns({name: RigEnv("panda_table", engine=name, overrides=("cameras={}",)) for name in ENGINES}, seconds)
 
 
-ROBOSUITE = """
-import os, sys, time
-os.environ.setdefault("MUJOCO_GL", "egl")
-import numpy as np
-import robosuite
-env = robosuite.make(
-    "Lift", robots="Panda", has_renderer=False, has_offscreen_renderer=True, use_camera_obs=True, control_freq=20,
-    camera_names=["frontview", "robot0_eye_in_hand"], camera_heights=256, camera_widths=256, camera_depths=True,
-)
-env.reset()
-still = np.zeros_like(env.action_spec[0])
-env.step(still)
-start, steps = time.perf_counter(), 0
-while time.perf_counter() - start < float(sys.argv[1]):
-    env.step(still)
-    steps += 1
-print(steps / (time.perf_counter() - start))
-"""
+ROBOSUITE_CAMERAS: dict[str, Any] = {
+    "has_offscreen_renderer": True,
+    "use_camera_obs": True,
+    "camera_names": ["frontview", "robot0_eye_in_hand"],
+    "camera_heights": 256,
+    "camera_widths": 256,
+    "camera_depths": True,
+}
 robosuite_python = ""
 """Interpreter with robosuite; empty for none."""
 
@@ -180,9 +172,8 @@ def cameras(seconds: float) -> None:
         environments["PyBullet's own"] = RigEnv("panda_table", engine="pybullet", overrides=own)
     step_in_turns(environments, seconds)
     if robosuite_python:
-        command = [robosuite_python, "-c", ROBOSUITE, str(seconds)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
-        print(f"  {'robosuite':16s} {float(done.stdout.split()[-1]):7.1f} steps/s")
+        rate = steps_of_robosuite(robosuite_python, seconds, **ROBOSUITE_CAMERAS)
+        print(f"  {'robosuite':16s} {rate:7.1f} steps/s")
 
 
 def hold(_: float) -> None:
