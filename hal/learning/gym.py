@@ -384,9 +384,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
                 self._leads, chosen, self._streams, self._objects
             )
-            free = (
-                unattended or self._deadman is not None
-            )  # whether its pad can be trusted is checked at the reset: it may be asleep
+            # Whether a pad can be trusted is checked at the reset: it may be asleep.
+            free = unattended or self._deadman is not None
             for arm in chosen_robots:  # checks the arguments of its session, and opens none
                 checked = arm.control(rate_hz=rate_hz, unattended=free, controller=controller)
                 if checked.controller != Position() and action == "torque":
