@@ -19,7 +19,7 @@ __all__ = ["PROGRAMS", "main", "parser"]
 
 PROGRAMS = {
     "teleop": "drive an arm: page in a browser, gamepad, terminal, recorded tour",
-    "check": "check this computer, real arms and cameras before they move; show gamepads, CAN adapters",
+    "check": "check this computer, arms and cameras; list gamepads and CAN adapters",
     "collect": "record demonstrations",
     "review": "view, check and repair a dataset",
     "dataset": "list, mark, delete, trim, merge, split and check recorded episodes",

@@ -172,7 +172,7 @@ class GripperModel(Strict):
         return self
 
     def _turned(self) -> bool:
-        """Return whether the widths are those of a joint whose ends are the other way round."""
+        """Return whether the widths grow where the joint closes."""
         first, (near, less), (far, more) = self.joints[0], self.widths[0], self.widths[-1]
         return (first.open - first.closed) * (far - near) * (more - less) < 0.0  # type: ignore[operator]  # both given
 
@@ -428,7 +428,8 @@ def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Pa
         return user_path(name, base)
     there = list_data(folder, *parts)
     if name not in there:
-        return f"there is no {'/'.join((folder, *parts))} model {name!r}{nearest(name, there)}, or a path to your own"
+        kind = (folder, *parts)[-1].removesuffix("s")
+        return f"there is no {kind} model {name!r}{nearest(name, there)}, or a path to your own"
     return data_folder(folder).joinpath(*parts, f"{name}.yaml")
 
 

@@ -172,7 +172,8 @@ class PolicyClient:
             )
         except (aiohttp.ClientError, OSError, ValueError, asyncio.TimeoutError) as error:
             await self._disconnect()
-            reason = str(error) or "no answer"
+            cause = getattr(error, "os_error", None)  # of aiohttp, whose own text has its parameters
+            reason = (cause and cause.strerror) or str(error) or "no answer"
             raise PolicyError(f"no policy server at {self.url}: {reason}", code="policy_unreachable") from error
         self._listen()
         metadata = await self._receive(CONNECT_TIMEOUT)
