@@ -365,7 +365,7 @@ def finish_replacement(out: str | Path) -> None:
     if not target.root.exists():
         target.beside("replaced").rename(target.root)
         return
-    with contextlib.suppress(OSError):  # the folder is in use, or no longer empty
+    try:
         fd = _lock_file(target)
         if fd is not None:
             try:
@@ -374,6 +374,9 @@ def finish_replacement(out: str | Path) -> None:
                 target.beside("replaced").rename(target.root)
             finally:
                 os.close(fd)
+    except OSError as error:  # the folder is no longer empty, or another program did the same meanwhile
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT):
+            raise
 
 
 def _is_hidden(target: DatasetLayout) -> bool:
@@ -449,7 +452,7 @@ def lock_dataset(layout: DatasetLayout, *, only_read: bool = False) -> Iterator[
     deadline = time.monotonic() + _PATIENCE
     while (fd := _lock_now(layout, only_read)) is None:
         if time.monotonic() > deadline:
-            raise CommandError(f"another program is recording into {layout.root}", code="dataset_locked")
+            raise CommandError(f"another program is writing {layout.root}", code="dataset_locked")
         time.sleep(0.05)
     try:
         yield
