@@ -184,7 +184,8 @@ def read_urdf(path: Path, *, meshes: bool = True) -> UrdfModel:
     data, folder = path.read_bytes(), path.resolve().parent
     model, files = _read(data, path, folder)
     if any(mesh_file(name, folder) != file for name, file in files.items()):  # they were moved since
-        model, files = _read.__wrapped__(data, path, folder)
+        _read.cache_clear()
+        model, files = _read(data, path, folder)
     if meshes:
         for name, file in files.items():
             _check_mesh(name, file)
