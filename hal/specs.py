@@ -180,7 +180,8 @@ class RobotSpec:
     emulated: bool = False
     """Whether all its real devices are emulators, so that nothing physical moves."""
     same: str | None = None
-    """The arm to which the body of their robot belongs, if this is another arm of it: this one is without that body."""
+    """Name of the arm whose record includes the robot's body, if this is another arm of the same robot; this arm's URDF
+    leaves the body out."""
     group: str | None = None
     """Arms with the same one share a process in real time; None for a process of its own."""
     deadline_max: float = 1.0

@@ -353,11 +353,11 @@ def _parts(file: Path) -> list[Array]:
 
 
 def _uniform(mass: float, shape: Shape) -> Inertial:
-    """Return the mass of a primitive of uniform density."""
+    """Return the mass and the inertia of a primitive of uniform density."""
     if shape.kind == "box":
         return Inertial(mass, mass * _box_inertia(shape.corners()), shape.pose)
     r, half = shape.size[0], shape.size[-1] if len(shape.size) == 2 else 0.0
-    ends = 0.0 if shape.kind == "cylinder" else 4.0 * r / (4.0 * r + 6.0 * half)  # the mass's share in the caps
+    ends = 0.0 if shape.kind == "cylinder" else 4.0 * r / (4.0 * r + 6.0 * half)  # share of the mass in the caps
     across = (1.0 - ends) * (r * r / 4.0 + half * half / 3.0) + ends * (0.4 * r * r + half * half + 0.75 * half * r)
     along = (1.0 - ends) * r * r / 2.0 + ends * 0.4 * r * r
     return Inertial(mass, mass * np.array([across, across, along]), shape.pose)

@@ -68,9 +68,9 @@ class SimulatedBody:
         return frozenset(k for link, k in self.links.items() if own.isdisjoint(j.name for j in urdf.above(link)))
 
     def ignored_by(self, other: SimulatedBody) -> frozenset[int]:
-        """Return the numbers of the links that never touch another body: those of the robot that it is an arm of.
+        """Return the numbers of this body's links that ``other`` never touches.
 
-        These would be contacts within one robot, of which engines compute none.
+        They are its trunk, if ``other`` is another arm of the same robot: engines compute no contacts within one robot.
         """
         of_this_robot = isinstance(other.spec, RobotSpec) and other.spec.same == self.name
         return self._trunk if of_this_robot else frozenset()

@@ -119,8 +119,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._driven: float | None = None
         """Speed of the motion that the motors make, m/s; None while they hold since a reset."""
         self._placed = (0, 0.0, 0.0)
-        """The step after which the fingers were placed by a reset or a restored state, and the forces of
-        :meth:`_measure` since then, N: until the next step the engine may have those from before."""
+        """The step at which a reset or a restored state placed the fingers, and the force and the load (N) that are
+        measured until the next one: the engine may still have those of before."""
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 

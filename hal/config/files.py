@@ -255,10 +255,8 @@ def _find_duplicates(node: yaml.Node, place: tuple[str, ...], seen: set[int]) ->
         for key, value in node.value:
             name, line = str(getattr(key, "value", key)), key.start_mark.line + 1
             if name in lines and name != "<<":
-                yield (
-                    ".".join((*place, name)),
-                    f"is given twice, in lines {lines[name]} and {line}; names must be unique",
-                )
+                message = f"is given twice, in lines {lines[name]} and {line}; names must be unique"
+                yield ".".join((*place, name)), message
             lines.setdefault(name, line)
             yield from _find_duplicates(value, (*place, name), seen)
     elif isinstance(node, yaml.SequenceNode):

@@ -202,7 +202,10 @@ def _wrong_same(context: Context, name: str, config: RobotConfig, first: str) ->
     if first not in others:
         return f"this rig has no other robot {first!r}{nearest(first, others)}", "unknown_robot"
     if robots[first].same is not None:
-        return f"robot {first!r} names {robots[first].same!r} itself: name one that names none", "conflict"
+        return (
+            f"robot {first!r} has same: {robots[first].same} itself; name the one without",
+            "conflict",
+        )
     if robots[first].model != config.model:
         return f"robot {first!r} is another model, {robots[first].model!r}, not {config.model!r}", "conflict"
     if "base" in config.model_fields_set and config.base != robots[first].base:

@@ -34,7 +34,7 @@ _TORQUE_STOP = 0.1
 
 _POSES, _HEAVIER = 512, 1.1
 """Random positions in which the inertia of an arm is computed, and the greatest inertia of a joint as a multiple of
-that in any of these: 1.08 at most with 20,000 positions of each arm in ``robots/``."""
+that in any of these. Chosen as a margin for all other positions."""
 
 _FOLLOWS_SETPOINT = (RobotStatus.FOLLOWING, RobotStatus.STOPPING, RobotStatus.HOLDING, RobotStatus.TRIPPED)
 

@@ -388,7 +388,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             free = unattended or self._deadman is not None
             for arm in chosen_robots:  # checks the arguments of its session, and opens none
                 checked = arm.control(rate_hz=rate_hz, unattended=free, controller=controller)
-                if checked.controller != Position() and action == "torque":
+                if action == "torque" and checked.controller != Position():
                     raise CommandError("action='torque' takes no controller", code="torques_by_controller")
         except BaseException:
             self.rig.close()

@@ -120,7 +120,7 @@ class PolicyOutcome:
     ended: str
     """``success``, ``failure`` (marked by the operator), ``time``, ``stopped`` or ``error``."""
     reason: str
-    """Why it was stopped, with the names of the arms that were if there are several; or what the policy raised."""
+    """Why it was stopped, after the names of the stopped arms if there are several; or what the policy raised."""
     seconds: float
     """Time that the policy drove, without pauses, s."""
     turns: int

@@ -44,7 +44,7 @@ _OF_GRIPPER = STATES[-3:]
 _SUMMED = ("joint_velocity", "tcp_delta")
 """Kinds of actions that are steps from one target to the next."""
 _FOLLOWED = 0.9
-"""Share of the rig's speeds that steps may use up: an arm that starts to move later can catch up."""
+"""Share of the rig's speeds that a step may use; the rest lets an arm that starts late catch up."""
 
 
 def _known_state(name: str) -> str:
@@ -242,8 +242,8 @@ def _moved(pose: Pose, step: Array) -> Pose:
 def _possible_share(robot: Robot, q: Array, goal: Array, period: float) -> float:
     """Return the share of a step between joint positions that an arm covers in ``period`` s, at the rig's speeds.
 
-    A policy that commands speeds, as DROID's, counts on an arm that moves more slowly where it cannot follow. Targets
-    farther away would only leave it ever farther behind, so that the next chunk would seem to jump.
+    Policies that command speeds, such as DROID's, were trained on arms that move more slowly where they cannot follow.
+    Targets farther away would leave the arm farther behind with each step, and the next chunk would be a jump.
     """
     spec = robot.spec
     joints = np.abs(goal - q) / (spec.speed * np.asarray(spec.limits.velocity))

@@ -179,7 +179,7 @@ class ArmMotion:
                 if servo.session == session._id:
                     if servo.off_path:
                         raise MotionStopped(
-                            f"{robot.name} was moved away from its path, or nothing leads on along it",
+                            f"{robot.name} cannot continue on its path: it was moved away from it, or no plan leads on",
                             "plan a new motion",
                             code="off_path",
                         )

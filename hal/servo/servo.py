@@ -481,7 +481,7 @@ class Servo:
             if self._anchoring.waiting:
                 self._anchoring.waiting = False  # the next one may be computed ahead, before the device is heard
             elif motion is self._whole and compliance.held_back:
-                smoother.stop()  # it may still have the speed of an arm that was pushed on
+                smoother.stop()  # the set-point may still have the speed of an arm that was pushed
             else:
                 motion.step(now)
             self._envelope.note(smoother)

@@ -280,10 +280,10 @@ class TorqueBounds:
         return [old + max(-step, min(step, new - old)) for old, new in zip(tau, goal, strict=True)]
 
     def together(self, tau: Floats, goal: Floats) -> list[float]:
-        """Return the same, with all torques changed in proportion.
+        """Return ``tau`` (n,) moved by one tick towards ``goal``, all torques by the same share of the way, Nm.
 
-        Where axes of joints are nearly in line, they turn against each other with next to no inertia: torques that are
-        late each by itself accelerate them that way, those that are late together only slow the motion down.
+        Joints whose axes are nearly in line turn against each other with next to no inertia. Torques that are late one
+        by one accelerate them that way; torques that are late together only slow the motion down.
         """
         most = max([abs(new - old) for old, new in zip(tau, goal, strict=True)])
         if most <= self._step:
@@ -420,7 +420,7 @@ def _around(
 ) -> list[tuple[float, float]]:
     """Return the ranges from ``lower`` to ``upper``, widened where ``at`` is outside or at their edge.
 
-    They were ``before`` in the session before this one.
+    ``before`` are the ranges of the session before.
     """
     each = zip(lower, upper, at, before, strict=True)
     return [(_least(low, x, least), -_least(-high, -x, -most)) for low, high, x, (least, most) in each]
@@ -431,7 +431,7 @@ def _least(low: float, x: float, before: float) -> float:
 
     An arm that is where the session before it ended gets no more room, or it could creep out from session to session.
     """
-    moved = before >= low or x < before - _SLACK  # it was inside, or something else has moved it
+    moved = before >= low or x < before - _SLACK  # the arm was inside, or something else has moved it since
     return min(low, x - _SLACK if moved else max(x - _SLACK, min(x, before)))
 
 
