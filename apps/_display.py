@@ -314,7 +314,7 @@ class RunReport:
                 "ticks": group["ticks"],
                 "missed": group.get("missed", 0),
                 "period_ms": _summary(group.get("period_s")),
-                **{key: own[key] for key in ("reanchored", "reports", "report_lag", "report_noise", "mismatches")},
+                **{key: own[key] for key in ("reanchored", "lost", "skipped", "mismatches", "report_error")},
                 "driver": own["driver"],
             },
             "latency_ms": {"p50": _ms(latency["p50"]), "p99": _ms(latency["p99"])},

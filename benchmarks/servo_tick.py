@@ -78,8 +78,8 @@ class Times:
 
     median: float
     p99: float
-    prepare: float
-    """Median of what is computed ahead."""
+    answer: float
+    """Median of the answer to a device that extrapolates, which gets the set-point of the tick before."""
     reference: float
 
 
@@ -89,14 +89,13 @@ def measure(
     values: Values,
     tcp_speed: float,
     ticks: int,
-    prepared: bool,
     idle: bool,
     controller: Controller,
 ) -> Times:
-    """Return the times of a tick, with or without computing ahead. Without a kind: move_to."""
+    """Return the times of a tick and of an answer. Without a kind: move_to."""
     kinematics = Kinematics(spec.kinematics)
     mass_matrix = Dynamics.of(spec).mass_matrix
-    servo = Servo(spec, 1 / RATE_HZ, kinematics, mass_matrix)
+    servo = Servo(spec, 1 / RATE_HZ, kinematics, mass_matrix, extrapolates=True)
     servo.anchor(spec.home)
     goal = tuple(x + 0.3 * math.cos(k) for k, x in enumerate(spec.home)) if kind is None else None
     servo.open_session(Session(1, 0.3, tcp_speed, False, goal, controller=controller_data(controller)), NO_INBOX)
@@ -105,38 +104,39 @@ def measure(
     start = list(q)
     inverse = np.linalg.inv(mass_matrix(start))
     command = None
-    times, ahead, references = [], [], []
+    times, answers, references = [], [], []
     for k in range(ticks):
         due = time.perf_counter() + 1 / RATE_HZ
         now += 1 / RATE_HZ
         t = k / RATE_HZ
         if kind is not None and k % 20 == 0:  # 50 Hz
             command = CommandRecord(k + 1, 1, now, now + 0.1, kind, tuple(values(t, start)))
-        reading = Reading(now, now, k, q, dq)
+        reading = Reading(now, now, k, q, dq, None, q, dq)
         inbox = Inbox(command, None, 0, 0, now)
         begun = time.perf_counter_ns()
+        answer = servo.answer(now, reading)
+        answered = time.perf_counter_ns()
         setpoint = servo.tick(now, reading, inbox)
         ended = time.perf_counter_ns()
         bare.tick(t)
         references.append(time.perf_counter_ns() - ended)
-        times.append(ended - begun)
+        times.append(ended - answered)
         assert setpoint is not None
         if setpoint.tau is None:
-            q = list(setpoint.q)
+            if answer is not None:
+                answers.append(answered - begun)
+                dq = [(x - y) * RATE_HZ for x, y in zip(answer.q, q, strict=True)]
+                q = list(answer.q)
         else:  # an arm without friction, whose inertia does not change
             dq = [v + a / RATE_HZ for v, a in zip(dq, inverse.dot(setpoint.tau).tolist(), strict=True)]
             q = [x + v / RATE_HZ for x, v in zip(q, dq, strict=True)]
-        if prepared:
-            begun = time.perf_counter_ns()
-            servo.prepare(inbox)
-            ahead.append(time.perf_counter_ns() - begun)
         if idle:
             time.sleep(max(0.0, due - time.perf_counter()))
     if servo.report.trip or max(abs(a - b) for a, b in zip(q, start, strict=True)) < 1e-3:
         raise RuntimeError(f"{kind}: the arm did not move as it should: {servo.report}")
     times.sort()
     median, p99 = statistics.median(times) / 1e3, times[int(0.99 * ticks)] / 1e3
-    return Times(median, p99, statistics.median(ahead or [0]) / 1e3, statistics.median(references) / 1e3)
+    return Times(median, p99, statistics.median(answers or [0]) / 1e3, statistics.median(references) / 1e3)
 
 
 def audit_time(ticks: int) -> float:
@@ -206,13 +206,13 @@ def main() -> None:
         ("twists, JointImpedance", spec, Kind.TWIST, twist, capped, joints),
     ]
     gc.disable()
-    heads = ("median", "p99", "prepared", "p99", "ahead", "reference", "ratio")
+    heads = ("median", "p99", "answer", "reference", "ratio")
     print(f"{'kind of command':34s}" + "".join(f"{head:>10s}" for head in heads) + "   (us)")
     for name, case, kind, values, tcp_speed, controller in [*((*each, Position()) for each in cases), *controlled]:
         how = (values, tcp_speed, ticks)
-        plain, ready = (measure(case, kind, *how, prepared, idle, controller) for prepared in (False, True))
-        numbers = (plain.median, plain.p99, ready.median, ready.p99, ready.prepare, ready.reference)
-        print(f"{name:34s}" + "".join(f"{x:10.1f}" for x in (*numbers, ready.median / ready.reference)))
+        found = measure(case, kind, *how, idle, controller)
+        numbers = (found.median, found.p99, found.answer, found.reference, found.median / found.reference)
+        print(f"{name:34s}" + "".join(f"{x:10.1f}" for x in numbers))
     print(f"{'audit, one sample':34s} {audit_time(ticks):8.1f}")
 
 

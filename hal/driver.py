@@ -163,10 +163,10 @@ class RobotDriver(DeviceDriver):
     """Kinds of set-point that the device takes: ``position``, ``velocity``, ``torque``."""
     paces_itself: ClassVar[bool] = False
     """Whether the device sets the pace: :meth:`wait` then blocks until its next cycle (a Franka's state packets)."""
-    repeats: ClassVar[bool] = False
-    """Whether the device repeats the last set-point when one is lost. False if it extrapolates at constant
-    acceleration (a Franka), or if none can be lost. Only an extrapolation is corrected, because it looks different from
-    a report that is late."""
+    extrapolates: ClassVar[bool] = False
+    """Whether the device continues at constant acceleration while it gets no set-point (a Franka); any other one stays.
+    Such a device counts its cycles in ``seq``, and reports in ``q_commanded`` and ``dq_commanded`` what it commands
+    itself in that cycle, in single precision or better. The servo continues from there, and answers it at once."""
     engaged: bool = True
     """Whether the drives are on, so that the arm holds and follows. A driver that has to switch them on (see
     :meth:`engage`) sets it to False until then, and again when a fault or a lost link switched them off."""

@@ -41,7 +41,6 @@ class DamiaoArm(RobotDriver):
     """A chain of Damiao motors, as its settings describe it (:class:`~.settings.DamiaoArmSettings`)."""
 
     modes: ClassVar[frozenset[str]] = frozenset({"position", "torque"})
-    repeats: ClassVar[bool] = True
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)

@@ -64,7 +64,6 @@ class PiperArm(RobotDriver):
     """A PiPER (settings: :class:`~.settings.PiperArmSettings`)."""
 
     modes: ClassVar[frozenset[str]] = frozenset({"position"})
-    repeats: ClassVar[bool] = True
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)

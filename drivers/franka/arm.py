@@ -12,7 +12,7 @@ import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import dist, inf
+from math import inf
 from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
@@ -40,8 +40,6 @@ _RATED_COMMANDS = 200
 _NO_TORQUE = (0.0,) * 7
 _MAX_START_SPEED = 5e-3
 """Largest speed of a motion's first set-point, rad/s (5 rad/s2 for one cycle): a motion starts at rest."""
-_DRIFT = 1e-6
-"""Largest distance of a velocity controller's own position from the set-points, rad, unless one was lost."""
 _NOT_SHOWN: tuple[ArmMode | None, Fault | None] = (None, None)
 _READY_MODES = frozenset({ArmMode.IDLE, ArmMode.MOVE})
 _MANUAL_MODES = frozenset({ArmMode.USER_STOPPED, ArmMode.GUIDING, ArmMode.OTHER})
@@ -53,6 +51,7 @@ class FrankaArm(RobotDriver):
 
     modes: ClassVar[frozenset[str]] = frozenset({"position", "velocity", "torque"})
     paces_itself: ClassVar[bool] = True
+    extrapolates: ClassVar[bool] = True
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
@@ -158,11 +157,9 @@ class FrankaArm(RobotDriver):
             return setpoint.tau
         if kind is StreamKind.POSITION:
             return setpoint.q
-        # The velocity that brings the controller's own position to the set-point within one cycle, so that nothing
-        # drifts. A late or noisy report is not that position.
-        start = s.q_d
-        if setpoint.q_from is not None and dist(start, setpoint.q_from) > _DRIFT:
-            start = setpoint.q_from
+        # The velocity that brings the controller's own position to the set-point within one cycle. The servo follows
+        # that position by the robot's rule; a report is rounded, and may be late.
+        start = s.q_d if setpoint.q_from is None else setpoint.q_from
         return [(q - q_d) * self.spec.rate_hz for q, q_d in zip(setpoint.q, start, strict=True)]
 
     def _start_motion(self, link: ArmLink, kind: StreamKind, s: ArmSample, setpoint: Setpoint) -> None:

@@ -155,10 +155,10 @@ def _check_mode(mode: str, flags: list[str]) -> CheckResult:
 
 
 def _check_noise(noise: float) -> CheckResult:
-    """Check how exactly an arm at rest reports its set-points. The delay of the reports shows only in motion."""
+    """Check how exactly an arm at rest reports its set-points."""
     from hal.servo.anchoring import NOISIEST
 
-    found = f"reported within {noise:.1g} rad at rest; the first motion shows their delay (rig.statistics())"
+    found = f"reported within {noise:.1g} rad at rest"
     if noise <= NOISIEST:
         return CheckResult("set-points", "ok", found)
     remedy = f"the servo needs {NOISIEST:g} rad; end the program that moves the arm, then check again"

@@ -42,7 +42,6 @@ class MockRobot(RobotDriver):
 
     modes: ClassVar[frozenset[str]] = frozenset({"position", "torque"})
     simulated: ClassVar[bool] = True
-    repeats: ClassVar[bool] = True
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)

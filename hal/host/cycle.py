@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import registry
 from ..commands import Inbox, Session
-from ..driver import Reading, RobotDriver
+from ..driver import Reading, RobotDriver, Setpoint
 from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, Fault, NotSupported, RobotFault
 from ..geometry import Pose
 from ..histogram import Histogram
@@ -90,7 +90,7 @@ class ArmUnit:
         self.driver: RobotDriver = registry.load(spec.driver, "robot")(spec, world)
         self.kinematics = Kinematics(spec.kinematics)
         mass_matrix = self.driver.mass_matrix if "torque" in self.driver.modes else None
-        self.servo = Servo(spec, dt, self.kinematics, mass_matrix, self.driver.repeats, self.driver.simulated)
+        self.servo = Servo(spec, dt, self.kinematics, mass_matrix, self.driver.extrapolates, self.driver.simulated)
         self.reset_statistics()
         self.reading: Reading | None = None
         self.error: ConnectionLost | None = None
@@ -99,11 +99,9 @@ class ArmUnit:
         self._engaged = False
         """Whether the drives were on in the last cycle."""
         self._sound: Reading | None = None
-        self._setpoint: Any = None
+        self._setpoint: Setpoint | None = None
         self._latest_target = 0
         self._reanchored = 0
-        self._prepared: Inbox | None = None
-        """The inbox from which the next set-point was computed ahead; None if it was not."""
         self._t_written = 0.0
         self._t_read = 0.0
         """Time of the last attempt to read the device, s."""
@@ -180,7 +178,7 @@ class ArmUnit:
         self.error = ConnectionLost(f"{self.spec.name}: {type(error).__name__}: {error}")
 
     def tick(self, now: float, app: AppRecord, late: bool = False) -> None:
-        """Compute the next set-point.
+        """Compute the next set-point; first write the one that was computed ahead.
 
         Args:
             now: Time on the group's clock, s.
@@ -191,11 +189,12 @@ class ArmUnit:
         if self._session and marks.ended == self._session:  # through memory, so that it waits for no answer
             self.servo.close_session()
         if self.error is not None or self.reading is None or self._drives_went_off(self.reading):
-            self._prepared = None
             self._setpoint = self.servo.device_lost(now)
             return
-        inbox, self._prepared = self._prepared or self._inbox(app, marks), None
-        self._setpoint = self.servo.tick(now, self.reading, inbox, late)
+        ahead = self.servo.answer(now, self.reading)
+        if ahead is not None:  # the device waits for it
+            self._pass_on(ahead, now)
+        self._setpoint = self.servo.tick(now, self.reading, self._inbox(app, marks), late)
         if self.servo.report.reanchored != self._reanchored:
             self._reanchored = self.servo.report.reanchored
             self.reanchored += 1
@@ -209,21 +208,16 @@ class ArmUnit:
         before, self._engaged = self._engaged, self.driver.engaged
         return before and not self._engaged and reading.fault is None
 
-    def prepare(self, app: AppRecord) -> None:
-        """Compute the next set-point ahead, for a device that sets the pace and waits for its answer."""
-        if self._setpoint is not None and self.driver.paces_itself:
-            self._prepared = self._inbox(app, self.mail.get_marks())
-            self.servo.prepare(self._prepared)
-
     def _inbox(self, app: AppRecord, marks: Marks) -> Inbox:
         return Inbox(self.mail.get_command(), self.mail.get_deadman(), app.stops, marks.rearms, app.t)
 
     def write(self, now: float) -> None:
         """Write the set-point to the device, or switch its drives on where it has to move."""
-        setpoint = self._setpoint
         failed, self._write_failed = self._write_failed, False
-        if setpoint is None or (self.error is not None and not failed):
-            return
+        if self._setpoint is not None and not self.servo.ahead and (self.error is None or failed):
+            self._pass_on(self._setpoint, now)
+
+    def _pass_on(self, setpoint: Setpoint, now: float) -> None:
         driver = self.driver
         try:
             if not driver.engaged:  # they went off during the session
@@ -261,7 +255,7 @@ class ArmUnit:
         self._latest_target = target
         command = self.mail.get_command()
         if command is not None and command.seq == target and command.t_event > 0.0:
-            ahead = self.dt if self.driver.paces_itself else 0.0  # it is written in the next cycle
+            ahead = self.dt if self.driver.extrapolates else 0.0  # it is written in the next cycle
             self.latency.add(clock_now + ahead - command.t_event)
 
     def publish(self, now: float) -> None:
@@ -478,7 +472,6 @@ class Cycle:
         for unit in self._arm_units:
             unit.write(now)
             unit.finish_session()
-            unit.prepare(app)
         for gripper in self._gripper_units:
             gripper.serve(app)
 

@@ -97,7 +97,7 @@ class Servo:
         dt: float,
         kinematics: Kinematics | None = None,
         mass_matrix: MassMatrix | None = None,
-        repeats: bool = False,
+        extrapolates: bool = False,
         simulated: bool = False,
     ) -> None:
         """Make the servo of one arm.
@@ -107,7 +107,7 @@ class Servo:
             dt: Time between two ticks, s.
             kinematics: The arm's kinematics, if they are loaded already.
             mass_matrix: Inertia of a device that takes torques; without it, torque commands are refused.
-            repeats: Whether the device repeats its last set-point when one is lost (see :attr:`.RobotDriver.repeats`).
+            extrapolates: What the device does when a set-point is lost (see :attr:`.RobotDriver.extrapolates`).
             simulated: Whether the arm has the joint damping of its URDF, which controllers then compensate.
         """
         self.spec = spec
@@ -116,7 +116,7 @@ class Servo:
         self._smoother = smoother = JointSmoother(spec.limits, dt)
         self._envelope = envelope = Envelope(smoother, self.kinematics, spec.workspace)
         self._watchdog = Watchdog(dt)
-        self._anchoring = Anchoring(smoother, repeats)
+        self._anchoring = Anchoring(smoother, extrapolates)
         limits = list(zip(spec.limits.lower, spec.limits.upper, strict=True))
         self._range = [(low - _BEYOND, high + _BEYOND) for low, high in limits]
         # Positions this near to the middle of their ranges are in them: one distance, not two comparisons a joint.
@@ -151,15 +151,11 @@ class Servo:
         """Time for which a controller has held a session open that is closing, s."""
         self._resting = 0
         """Number of ticks for which a session that is closing has been at rest."""
-        self._corrected = False
-        """Whether the set-point was re-anchored in the last tick."""
-        self._ahead = False
-        """Whether set-points are computed ahead in this session."""
-        self._ready: Setpoint | None = None
-        """The set-point that :meth:`prepare` computed for the next tick."""
-        self._seen = (0.0, _NO_TRIP, False, False)
-        """Of the last reading: its time, the trip that it causes, whether the host was late, whether there is a fault.
-        """
+        self._extrapolates = extrapolates
+        self._ahead: Setpoint | None = None
+        """The set-point that the next reading is answered with."""
+        self._compared = self._corrected = False
+        """Whether the newest reading was compared with what was given, and the set-point corrected."""
 
     @property
     def active(self) -> bool:
@@ -197,8 +193,8 @@ class Servo:
                 code="bad_anchor",
             )
         self._smoother.anchor(self._anchoring.start_position(q) if dq is None else q, dq)
-        self._ready = None
         self._torque.active = self._compliance.active = False
+        self._ahead = None
         self._anchoring.forget()
         self._anchored = True
         self._forget_goals()
@@ -230,17 +226,16 @@ class Servo:
             self._path.set_goal(session.move_to)
             self._whole = self._path
         self._session = session
-        self._ending = self._ahead = False
+        self._ending = False
         self._resting = 0
         self._braking = 0.0
-        self._ready = None
+        self._ahead = None
         self._seq = 0
         self.report.target_seq = self.report.refused = 0
         self.report.arrived = self.report.off_path = False
         self.report.progress, self.report.held_back = 0.0, Limited.NONE
         self._forget_goals()
         self._watchdog.open_session(session, inbox)
-        self._anchoring.relearn()
         self.report.status = RobotStatus.HOLDING
         self.report.trip = Trip.NONE
 
@@ -266,14 +261,13 @@ class Servo:
             late: Whether this process was paused in a way that ``now`` does not show (a suspended computer).
 
         Returns:
-            The set-point; None while no session is open.
+            The set-point; None while no session is open. A device that extrapolates gets it from :meth:`answer`, after
+            its next reading, unless it has torques (see :attr:`ahead`).
         """
         session = self._session
         late = self._is_late(now) or late
-        ready, self._ready = self._ready, None
-        self._corrected = False
-        if ready is None:
-            self._envelope.limited = _UNLIMITED
+        compared, self._compared = self._compared, False
+        self._envelope.limited = Limited.REANCHORED if compared and self._corrected else _UNLIMITED
         device = self._find_trip(now, reading)
         if session is None:
             self._anchoring.note_rest(None if device else reading.q_commanded)
@@ -287,21 +281,63 @@ class Servo:
         else:
             if known:
                 torque.q, torque.dq = reading.q, reading.dq  # where torques would begin
-            if session is not None and self._anchoring.check_report(reading, device):
-                ready = None
-                self._corrected = True
-                self._resting = 0
-                self.report.reanchored += 1
-                self._envelope.limited = Limited.REANCHORED
-                if self._motion is not None:
-                    self._motion.reanchored()
+            if session is not None and not compared:
+                self._compare(reading, device)
+        self._watchdog.update(now, inbox, self._at_rest(), device, late)
         faulty = device is _FAULT
-        self._seen = (now, device, late, faulty)
-        # What was computed ahead is written even if something is wrong: the stop begins where it ends.
-        setpoint = self._decide(inbox, now, device, late, faulty) if ready is None else ready
+        if session is None or (self._ending and self._finished()):
+            self._idle(RobotStatus.FAULT if faulty else RobotStatus.IDLE)
+            return None
+        self._accept_command(now, session, inbox.command)
+        setpoint = self._move(now, RobotStatus.FAULT if faulty else None)
         if setpoint is not None and setpoint.tau is None:
-            self._anchoring.note_given(setpoint)
+            if self._extrapolates:
+                self._ahead = setpoint
+            else:
+                self._anchoring.note_given(setpoint)
         return setpoint
+
+    @property
+    def ahead(self) -> bool:
+        """Whether the last set-point is kept for :meth:`answer`."""
+        return self._ahead is not None
+
+    def answer(self, now: float, reading: Reading) -> Setpoint | None:
+        """Return at once the set-point that a device which extrapolates gets after this reading.
+
+        It is the one that the last tick computed. If the device lost the one before, it is one step of a stop, from
+        where the device is; the next tick continues from there. So the answer never waits for a long computation, a
+        single loss costs a step, and an arm whose set-points are late again and again slows down.
+
+        Args:
+            now: Time, s.
+            reading: The newest reading of the device, also passed to the next :meth:`tick`.
+
+        Returns:
+            The set-point; None if nothing was computed ahead.
+        """
+        setpoint, self._ahead = self._ahead, None
+        if setpoint is None or self._torque.active:
+            return None
+        self._compared = True
+        if self._compare(reading, self._find_trip(now, reading)):
+            smoother = self._smoother
+            q_from = smoother.q
+            smoother.stop()
+            setpoint = Setpoint(smoother.q, smoother.dq, smoother.ddq, None, q_from)
+        self._anchoring.note_given(setpoint)
+        return setpoint
+
+    def _compare(self, reading: Reading, device: Trip) -> bool:
+        """Compare a reading with what was given; returns whether the set-point was corrected."""
+        self._corrected = self._anchoring.check_report(reading, device)
+        if self._corrected:
+            self._resting = 0
+            self.report.reanchored += 1
+            self._envelope.limited = Limited.REANCHORED
+            if self._motion is not None:
+                self._motion.reanchored()
+        return self._corrected
 
     @property
     def fault(self) -> Fault | None:
@@ -309,7 +345,7 @@ class Servo:
         return self._anchoring.fault
 
     def recover(self) -> None:
-        """Clear :attr:`fault`, and learn again how the device reports its set-points."""
+        """Clear :attr:`fault`."""
         self._anchoring.recover()
 
     def note_withheld(self) -> None:
@@ -317,21 +353,12 @@ class Servo:
         self._anchoring.note_withheld()
 
     def statistics(self) -> dict[str, Any]:
-        """Return how the device reports: ``reports``, ``report_lag``, ``report_noise`` (rad), ``mismatches``."""
+        """Return what became of the set-points: ``lost``, ``skipped``, ``mismatches``, ``report_error`` (rad)."""
         return self._anchoring.statistics()
 
     def reset_statistics(self) -> None:
-        """Set the count of mismatches to zero."""
+        """Set the counters to zero."""
         self._anchoring.reset_statistics()
-
-    def _decide(self, inbox: Inbox, now: float, device: Trip, late: bool, faulty: bool) -> Setpoint | None:
-        """Update the watchdog and the motion, and return the next set-point."""
-        self._watchdog.update(now, inbox, self._at_rest(), device, late)
-        if self._session is None or (self._ending and self._finished()):
-            self._idle(RobotStatus.FAULT if faulty else RobotStatus.IDLE)
-            return None
-        self._accept_command(now, self._session, inbox.command)
-        return self._move(now, RobotStatus.FAULT if faulty else None)
 
     def _is_late(self, now: float) -> bool:
         """Return whether the last tick of a real arm was too long ago: nothing supervised it in between."""
@@ -341,8 +368,8 @@ class Servo:
     def device_lost(self, now: float) -> Setpoint | None:
         """Trip and continue braking, because the device did not answer; return the next set-point or None."""
         self._t_tick = now
-        ready, self._ready = self._ready, None
         self._envelope.limited = Limited.NONE
+        self._ahead = None
         self._watchdog.device_lost(now)
         self._anchoring.note_silence()
         self._compliance.active = False
@@ -352,24 +379,7 @@ class Servo:
             self._idle(RobotStatus.LOST)
             return None
         self._forget_goals()
-        return self._move(now, RobotStatus.LOST) if ready is None else ready
-
-    def prepare(self, inbox: Inbox) -> None:
-        """Compute the next set-point ahead, in the idle part of the cycle, after the write.
-
-        For a device that must be answered quickly (a Franka: within 0.3 ms of its state). The next tick then only
-        checks whether the device took the last set-point, and returns the one that is ready; it computes another one if
-        the device did not. What the app and the device report takes effect one cycle later than without.
-        """
-        if self._torque.active:
-            self._torque.prepare()
-        elif self._session is not None and self._t_tick is not None:
-            now, device, late, faulty = self._seen
-            smoother = self._smoother
-            # For readers between this tick and the next.
-            self._envelope.limited = Limited.REANCHORED if self._corrected else _UNLIMITED
-            self._ahead = True
-            self._ready = self._decide(inbox, now + smoother.dt, device, late, faulty)
+        return self._move(now, RobotStatus.LOST)
 
     def _find_trip(self, now: float, reading: Reading) -> Trip:
         """Return the trip that this reading causes; ``Trip.NONE`` if the device is all right."""
@@ -478,9 +488,7 @@ class Servo:
         if compliance.chosen:
             self._prepare_compliance(motion)
         if motion is not None:
-            if self._anchoring.waiting:
-                self._anchoring.waiting = False  # the next one may be computed ahead, before the device is heard
-            elif motion is self._whole and compliance.held_back:
+            if motion is self._whole and compliance.held_back:
                 smoother.stop()  # the set-point may still have the speed of an arm that was pushed
             else:
                 motion.step(now)
@@ -551,8 +559,7 @@ class Servo:
             self._leave_torques()
         at_rest = self._smoother.at_rest() and not self._torque.active
         self._resting = self._resting + 1 if at_rest else 0
-        # What is computed ahead is given one tick later, and seen to be taken another one later.
-        if self._resting < (3 if self._ahead else 1):
+        if self._resting < (3 if self._extrapolates else 1):  # computed, given, and seen to be taken
             return False
         self._session = None
         self._ending = False

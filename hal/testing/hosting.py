@@ -78,7 +78,6 @@ class HostedRobot:
         unit.tick(now, app)
         unit.write(now)
         unit.finish_session()
-        unit.prepare(app)
         unit.publish(now)
 
     def _advance_to(self, t: float) -> None:

@@ -111,21 +111,16 @@ class Bench(HandTicked):
         deadman: bool = False,
         move_to: Sequence[float] | None = None,
         begin: bool = True,
-        repeats: bool = False,
+        extrapolates: bool = False,
         kinematics: Kinematics | None = None,
     ) -> None:
         super().__init__(panda() if spec is None else spec, rate_hz, 50.0, deadman)
-        self.servo = Servo(self.spec, self.dt, kinematics, repeats=repeats)
-        self.repeats = repeats
+        self.servo = Servo(self.spec, self.dt, kinematics, extrapolates=extrapolates)
+        self.extrapolates = extrapolates
         self.ticks = 0
         self.q: list[float] = list(self.spec.home)
         self.late = False
         """Whether there was a pause that the clock does not show."""
-        self.prepares = False
-        """Whether set-points are computed ahead."""
-        self.delays = False
-        """Whether the app's records reach the servo one tick later."""
-        self._heard: Inbox | None = None
         self.fault: Fault | None = None
         self.reading: dict[str, Any] = {}
         """Values of the next readings that are not the truth."""
@@ -139,6 +134,8 @@ class Bench(HandTicked):
         """Open the session; the app knew of so many stops then (all of them)."""
         self.session = self.session._replace(stops=self.stops if known_stops is None else known_stops)
         self.servo.open_session(self.session, self.inbox())
+        if self.extrapolates:
+            self.tick()  # what it computes is given with the next one
 
     @property
     def status(self) -> RobotStatus:
@@ -160,12 +157,10 @@ class Bench(HandTicked):
         self.ticks += 1
         values = {"q": self.q, "dq": STILL, "fault": self.fault} | self.reading
         reading = Reading(values.pop("t", self.now), self.now, values.pop("seq", self.ticks), **values)
-        inbox, self._heard = self._heard or self.inbox(), None
-        setpoint = self.servo.tick(self.now, reading, inbox, self.late)
-        if self.prepares or self.delays:
-            self._heard = self.inbox()
-        if self.prepares and self._heard is not None:
-            self.servo.prepare(self._heard)
+        answer = self.servo.answer(self.now, reading)
+        setpoint = self.servo.tick(self.now, reading, self.inbox(), self.late)
+        if answer is not None or self.servo.ahead:
+            setpoint = answer
         return self._take(setpoint)
 
     def lose(self) -> Setpoint | None:

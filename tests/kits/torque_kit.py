@@ -46,7 +46,6 @@ class Driven(HandTicked):
         """Whether the device does not answer."""
         self.tamper: Callable[[Reading], Reading] = lambda reading: reading
         """Changes a reading on its way to the servo."""
-        self.prepared = True
         self.setpoint: Setpoint | None = None
         self.given: list[Setpoint] = []
         """Set-points that the driver got."""
@@ -107,8 +106,6 @@ class Driven(HandTicked):
             self.driver.write(self.setpoint)
             self.given.append(self.setpoint)
             self.audit.add_setpoint(self.setpoint)
-        if self.prepared:
-            self.servo.prepare(self.inbox())
         return self.setpoint
 
     def drive(self, seconds: float, tau: Sequence[float] = NOTHING) -> None:

@@ -118,7 +118,11 @@ def test_no_limit_of_the_robot_is_ever_broken(arm: str, share: float) -> None:
     for begin in range(0, cycles, STRETCH):
         middle = [0.5 * (a + b) for a, b in zip(spec.limits.lower, spec.limits.upper, strict=True)]
         start = tuple(h + chance.uniform(-0.5, 0.5) * (m - h) for h, m in zip(spec.home, middle, strict=True))
-        servo, controller, commander = Servo(spec, DT), Controller(arm, start), Commander(spec, chance)
+        servo, controller, commander = (
+            Servo(spec, DT, extrapolates=True),
+            Controller(arm, start),
+            Commander(spec, chance),
+        )
         reading = controller.reading(0.0)
         servo.anchor(reading.q_commanded or ())
         inbox = commander.inbox(0, 0.0, list(start))
@@ -128,10 +132,10 @@ def test_no_limit_of_the_robot_is_ever_broken(arm: str, share: float) -> None:
         for cycle in range(1, min(STRETCH, cycles - begin)):
             now = cycle * DT
             reading = controller.reading(now)
-            setpoint = servo.tick(now, reading, inbox)
+            setpoint = servo.answer(now, reading)
+            servo.tick(now, reading, inbox)
             controller.take(setpoint, chance.random() < share)
             inbox = commander.inbox(cycle, now, list(controller.sample.q))
-            servo.prepare(inbox)
         travel, lost = travel + controller.travel, lost + controller.lost
         reanchored += servo.report.reanchored
     assert travel > 2e-5 * cycles, "nothing moved: the test shows nothing"

@@ -78,11 +78,10 @@ def test_the_tcp_goes_straight_within_every_limit(rate_hz: float, share: float) 
 
 @pytest.mark.parametrize("cause", ["deadman", "trip", "lost"])
 def test_a_stop_is_made_on_the_line_and_the_motion_continues_on_it(cause: str) -> None:
-    """At random times, also while it speeds up or brakes; prepared ahead or not."""
+    """At random times, also while it speeds up or brakes."""
     numbers = random.Random(1)
-    for k in range(8):
+    for _ in range(8):
         bench = bench_of(deadman=cause == "deadman")
-        bench.prepares = bool(k % 2)
         if cause == "deadman":
             bench.press()
         bench.begin()

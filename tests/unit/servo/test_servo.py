@@ -7,11 +7,10 @@ import random
 
 import pytest
 from servo_kit import STILL, Bench, N, load_streams
-from specs import PANDA_HOME, panda
+from specs import PANDA_HOME
 
 from hal.commands import Kind, Session
 from hal.errors import CommandError, ControlTaken
-from hal.specs import WorkspaceSpec
 from hal.types import Limited, RobotStatus, Trip
 
 streams = load_streams()
@@ -220,32 +219,3 @@ def test_a_start_outside_the_limits_only_comes_back_in() -> None:
     inside = [x - 0.09 * (k == 0) for k, x in enumerate(start)]
     bench.stream(0.5, Kind.JOINT_TARGET, [*inside, *STILL])
     assert bench.q == pytest.approx(inside)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_what_is_computed_ahead_is_what_would_be_computed_then(seed: int) -> None:
-    """Bit by bit, whatever is commanded, near singularities, faces and limits: only the app counts one tick later."""
-
-    def history(prepares: bool) -> list[list[float]]:
-        rng = random.Random(seed)
-        box = WorkspaceSpec((0.2, -0.2, 0.2), (0.7, 0.2, 0.8))
-        bench = Bench(panda(workspace=box), tcp_speed=rng.choice((0.25, 9.0)), deadman=seed % 2 == 0)
-        bench.prepares, bench.delays = prepares, not prepares
-        for _ in range(60):
-            if bench.deadman is not None and (not bench.deadman.held or rng.random() < 0.1):
-                bench.release() if bench.deadman.held else bench.press()
-            kind = rng.choice((Kind.TWIST, Kind.TWIST, Kind.CARTESIAN_TARGET, Kind.JOINT_TARGET, Kind.JOINT_VELOCITY))
-            if kind is Kind.CARTESIAN_TARGET:
-                x, y, z, *turn = bench.servo.kinematics.fk(bench.q)
-                values = [x + rng.uniform(-0.04, 0.04), y, z + rng.uniform(-0.04, 0.04), *turn]
-            elif kind is Kind.JOINT_TARGET:
-                values = [x + rng.uniform(-0.05, 0.05) for x in bench.q] + list(STILL)
-            elif kind is Kind.TWIST:
-                values = [rng.choice((0.0, 0.1, -0.4)) for _ in range(6)] + [rng.choice((0.0, 1.0))]
-            else:
-                values = [rng.uniform(-0.5, 0.5) for _ in range(N)]
-            bench.stream(0.04, kind, values, every=3)
-        assert bench.limited
-        return bench.history
-
-    assert history(True) == history(False)

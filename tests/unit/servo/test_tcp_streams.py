@@ -61,7 +61,6 @@ class Stream:
             begin=False,
         )
         bench = self.bench
-        bench.prepares = rng.random() < 0.2
         room = [(max(low, x - 0.7), min(high, x + 0.7)) for x, low, high in self._limits()]
         bench.q = [rng.uniform(low, high) for low, high in room]
         bench.servo.anchor(bench.q)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar
@@ -121,18 +120,6 @@ class TestFollowing:
         refused = arm.send(values)
         arm.tick()
         assert arm.servo.report.refused == refused
-
-    def test_what_is_computed_ahead_changes_nothing(self) -> None:
-        def given(prepared: bool) -> list[object]:
-            arm, rng = wheels(), random.Random(1)
-            arm.prepared = prepared
-            for _ in range(20):
-                arm.drive(0.05, [rng.uniform(-20.0, 20.0) for _ in range(N)])
-            arm.release()
-            arm.until_held()
-            return [tuple(setpoint) for setpoint in arm.given]
-
-        assert given(True) == given(False)
 
 
 class TestStopping:
