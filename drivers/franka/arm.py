@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
@@ -128,12 +129,16 @@ class FrankaArm(RobotDriver):
         if link is None or s is None:
             raise self._connection.error()
         if self._fault is not None or s.mode not in _READY_MODES:
+            self.withheld["not ready"] += 1
             return False
         kind = self._kind(setpoint)
-        if link.motion is None and max(map(abs, setpoint.dq)) > _MAX_START_SPEED:
-            return False  # the robot ended the last motion: the servo has to come to rest first
+        # The robot ended the last motion: the servo has to come to rest first. Torques have no set-point that moves.
+        if link.motion is None and setpoint.tau is None and max(map(abs, setpoint.dq)) > _MAX_START_SPEED:
+            self.withheld["no motion begins at a speed"] += 1
+            return False
         try:
             if link.motion is not kind:
+                self.withheld["a motion began"] += 1
                 self._start_motion(link, kind, s, setpoint)
                 return False
             link.send(self._values(kind, setpoint, s))
@@ -287,6 +292,8 @@ class FrankaArm(RobotDriver):
 
     def reset_statistics(self) -> None:
         self.commands = self.lost_states = self.aborts = 0
+        self.withheld: Counter[str] = Counter()
+        """Set-points that were not passed on, by reason."""
         self.success_min = inf
         self.answer_times = Histogram(2e-6, 2500)
 
@@ -296,6 +303,7 @@ class FrankaArm(RobotDriver):
             "lost_states": self.lost_states,
             "success_rate_min": None if self.success_min == inf else self.success_min,
             "received_to_sent_s": self.answer_times.summary(),
+            "withheld": dict(self.withheld),
             "aborts": self.aborts,
             "reconnects": self._connection.reconnects,
         }

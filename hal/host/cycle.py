@@ -100,6 +100,8 @@ class ArmUnit:
         """Whether the drives were on in the last cycle."""
         self._sound: Reading | None = None
         self._setpoint: Setpoint | None = None
+        self._answered = False
+        """Whether the device has got its set-point in this cycle."""
         self._latest_target = 0
         self._reanchored = 0
         self._t_written = 0.0
@@ -189,9 +191,10 @@ class ArmUnit:
         if self._session and marks.ended == self._session:  # through memory, so that it waits for no answer
             self.servo.close_session()
         if self.error is not None or self.reading is None or self._drives_went_off(self.reading):
-            self._setpoint = self.servo.device_lost(now)
+            self._setpoint, self._answered = self.servo.device_lost(now), False
             return
         ahead = self.servo.answer(now, self.reading)
+        self._answered = ahead is not None
         if ahead is not None:  # the device waits for it
             self._pass_on(ahead, now)
         self._setpoint = self.servo.tick(now, self.reading, self._inbox(app, marks), late)
@@ -214,7 +217,7 @@ class ArmUnit:
     def write(self, now: float) -> None:
         """Write the set-point to the device, or switch its drives on where it has to move."""
         failed, self._write_failed = self._write_failed, False
-        if self._setpoint is not None and not self.servo.ahead and (self.error is None or failed):
+        if self._setpoint is not None and not self._answered and (self.error is None or failed):
             self._pass_on(self._setpoint, now)
 
     def _pass_on(self, setpoint: Setpoint, now: float) -> None:
@@ -226,7 +229,7 @@ class ArmUnit:
                 self.servo.note_withheld()
                 return
             if driver.write(setpoint) is False:
-                self.servo.note_withheld()
+                self.servo.note_withheld(by_driver=True)
         except Exception as error:
             self._write_failed = True
             self._lose(error)
@@ -295,7 +298,8 @@ class ArmUnit:
 
     def _makes_sense(self, reading: Reading) -> bool:
         n = len(self.spec.joints)
-        return len(reading.q) == len(reading.dq) == n and math.isfinite(math.hypot(*reading.q, *reading.dq))
+        forces = (*(reading.tau or ()), *(reading.tau_ext or ()), *(reading.wrench_ext or ()))
+        return len(reading.q) == len(reading.dq) == n and math.isfinite(sum((*reading.q, *reading.dq, *forces)))
 
     # Requests.
 

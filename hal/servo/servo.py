@@ -156,6 +156,8 @@ class Servo:
         """The set-point that the next reading is answered with."""
         self._compared = self._corrected = False
         """Whether the newest reading was compared with what was given, and the set-point corrected."""
+        self._device = _NO_TRIP
+        """The trip that this reading causes."""
 
     @property
     def active(self) -> bool:
@@ -261,14 +263,14 @@ class Servo:
             late: Whether this process was paused in a way that ``now`` does not show (a suspended computer).
 
         Returns:
-            The set-point; None while no session is open. A device that extrapolates gets it from :meth:`answer`, after
-            its next reading, unless it has torques (see :attr:`ahead`).
+            The set-point; None while no session is open. A device that was answered gets it with the next
+            :meth:`answer`.
         """
         session = self._session
         late = self._is_late(now) or late
         compared, self._compared = self._compared, False
         self._envelope.limited = Limited.REANCHORED if compared and self._corrected else _UNLIMITED
-        device = self._find_trip(now, reading)
+        device = self._device if compared else self._find_trip(now, reading)
         if session is None:
             self._anchoring.note_rest(None if device else reading.q_commanded)
         torque = self._torque
@@ -291,36 +293,33 @@ class Servo:
         self._accept_command(now, session, inbox.command)
         setpoint = self._move(now, RobotStatus.FAULT if faulty else None)
         if setpoint is not None and setpoint.tau is None:
-            if self._extrapolates:
+            if compared:  # the device has its answer
                 self._ahead = setpoint
             else:
                 self._anchoring.note_given(setpoint)
         return setpoint
 
-    @property
-    def ahead(self) -> bool:
-        """Whether the last set-point is kept for :meth:`answer`."""
-        return self._ahead is not None
-
     def answer(self, now: float, reading: Reading) -> Setpoint | None:
         """Return at once the set-point that a device which extrapolates gets after this reading.
 
-        It is the one that the last tick computed. If the device lost the one before, it is one step of a stop, from
-        where the device is; the next tick continues from there. So the answer never waits for a long computation, a
-        single loss costs a step, and an arm whose set-points are late again and again slows down.
+        It is the one that the last tick computed. If there is none, or the device lost the one before, it is one step
+        of a stop, from where the device is; the next tick continues from there. So the answer never waits for a long
+        computation, a single loss costs a step, and an arm whose set-points are late again and again slows down.
 
         Args:
             now: Time, s.
             reading: The newest reading of the device, also passed to the next :meth:`tick`.
 
         Returns:
-            The set-point; None if nothing was computed ahead.
+            The set-point; None while no session is open, for another device, and for torques, which need the newest
+            reading.
         """
         setpoint, self._ahead = self._ahead, None
-        if setpoint is None or self._torque.active:
+        if not self._extrapolates or self._session is None or self._torque.active:
             return None
         self._compared = True
-        if self._compare(reading, self._find_trip(now, reading)):
+        self._device = self._find_trip(now, reading)
+        if self._compare(reading, self._device) or setpoint is None:
             smoother = self._smoother
             q_from = smoother.q
             smoother.stop()
@@ -348,9 +347,13 @@ class Servo:
         """Clear :attr:`fault`."""
         self._anchoring.recover()
 
-    def note_withheld(self) -> None:
-        """Note that the driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
-        self._anchoring.note_withheld()
+    def note_withheld(self, by_driver: bool = False) -> None:
+        """Note that the last set-point was not passed on.
+
+        Args:
+            by_driver: Whether the driver held it back (see :meth:`.RobotDriver.write`), which must not last.
+        """
+        self._anchoring.note_withheld(by_driver and self._followed)
 
     def statistics(self) -> dict[str, Any]:
         """Return what became of the set-points: ``lost``, ``skipped``, ``mismatches``, ``report_error`` (rad)."""
@@ -396,6 +399,9 @@ class Servo:
             return Trip.BAD_READING
         if reading.tau_commanded is not None and not self._has_sound_torques(reading):
             return Trip.BAD_READING
+        for values in (reading.tau, reading.tau_ext, reading.wrench_ext):
+            if values is not None and not isfinite(sum(values)):
+                return Trip.BAD_READING
         if not is_alive(now, reading.t, self._torque.patience if self._torque.active else SILENCE):
             return Trip.DEVICE_LOST  # it repeats an old reading
         return _NO_TRIP

@@ -134,8 +134,6 @@ class Bench(HandTicked):
         """Open the session; the app knew of so many stops then (all of them)."""
         self.session = self.session._replace(stops=self.stops if known_stops is None else known_stops)
         self.servo.open_session(self.session, self.inbox())
-        if self.extrapolates:
-            self.tick()  # what it computes is given with the next one
 
     @property
     def status(self) -> RobotStatus:
@@ -159,7 +157,7 @@ class Bench(HandTicked):
         reading = Reading(values.pop("t", self.now), self.now, values.pop("seq", self.ticks), **values)
         answer = self.servo.answer(self.now, reading)
         setpoint = self.servo.tick(self.now, reading, self.inbox(), self.late)
-        if answer is not None or self.servo.ahead:
+        if answer is not None:
             setpoint = answer
         return self._take(setpoint)
 

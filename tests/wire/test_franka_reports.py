@@ -112,3 +112,29 @@ def test_reports_that_fit_nothing_are_a_fault_with_a_name(fr3: Emulator) -> None
     again = drive(fr3)  # nothing is left of it
     assert again.travel > 0.2
     assert not again.error
+
+
+FIELDS = {
+    "q": "nan", "dq": "inf", "tau_J": "nan", "q_d": "inf", "dq_d": "nan", "tau_ext_hat_filtered": "nan",
+    "O_F_ext_hat_K": "inf",
+}  # fmt: skip
+
+
+def test_impossible_values_in_any_field_stop_the_arm(fr3: Emulator) -> None:
+    fr3.refresh()
+    with rig_of(fr3.host, "fr3", lock_step=True) as rig:
+        arm = arm_of(rig)
+        for field, value in FIELDS.items():
+            with arm.control(rate_hz=50, unattended=True) as control:
+                for _ in rig.clock.rate(50):
+                    control.send(hal.Twist([0.0, 0.05, 0.0]))
+                    if arm.state().dq_set.any():
+                        break
+                fr3.control.send(f"spoil {field} {value}")
+                rig.clock.sleep(0.05)
+                with pytest.raises(hal.MotionStopped) as caught:
+                    control.send(hal.Twist([0.0, 0.05, 0.0]))
+                assert caught.value.code == "bad_reading", field
+                fr3.control.send(f"spoil {field} off")
+                rig.clock.sleep(0.3)
+    assert not fr3.events("reflex")

@@ -348,8 +348,9 @@ class StateWriter:
         dtau = [(new - old) / DT for new, old in zip(tau, self._tau, strict=True)]
         self._tau = tau
         torques: Floats = motion.torques if motion is not None else (0.0,) * 7
-        packet.put_joints((*tau, *torques, *dtau, *q, *sample.q, *plant.dq, *sample.dq, *sample.ddq))
-        packet.put_motors((*q, *plant.dq))
+        measured, speeds = arm.reports.seen(q, plant.dq)
+        packet.put_joints((*tau, *torques, *dtau, *measured, *sample.q, *speeds, *sample.dq, *sample.ddq))
+        packet.put_motors((*measured, *speeds))
         packet.put_modes(*arm.modes)
         flags = (arm.errors, arm.last_errors)
         if flags != self._flags:
@@ -358,6 +359,8 @@ class StateWriter:
                 packet.put(name, [int(k in raised) for k in range(FLAG_COUNT)])
         packet.put("robot_mode", (arm.mode,))
         packet.put("control_command_success_rate", (motion.success_rate if motion is not None else 0.0,))
+        for name, value in arm.reports.spoiled.items():
+            packet.put(name, (value, *packet.get(name)[1:]))
         return packet.buffer
 
     def _write_poses(self, arm: EmulatedArm) -> None:

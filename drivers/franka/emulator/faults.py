@@ -30,6 +30,12 @@ COMMANDS = (
     FaultCommand("report-lag N", "report q_d, dq_d and ddq_d N cycles late (0 to 10)", noted=True),
     FaultCommand("report-noise S", "add noise to the reported q_d: normal, S rad", noted=True),
     FaultCommand("report-measured on|off", "report measured positions and speeds as q_d and dq_d", noted=True),
+    FaultCommand(
+        "sag S [V]",
+        "measure positions S rad away from the true ones, each joint to a random side, and shaking by V rad/s",
+        noted=True,
+    ),
+    FaultCommand("spoil FIELD nan|inf|off", "report that as the first value of a field of the state", noted=True),
     FaultCommand("truncate on|off", "send states that are one byte too short", noted=True),
     FaultCommand("reflex NAME|INDEX", "raise an error flag: a running motion is aborted, and recovery is required"),
     FaultCommand("user-stop on|off", "press or release the user stop"),
@@ -90,7 +96,7 @@ class PacketLoss:
 
 
 class SetpointReports:
-    """How the arm reports its set-points: correctly, unless a fault is injected."""
+    """How the arm reports its set-points and measurements: correctly, unless a fault is injected."""
 
     MAX_LAG = 10
     """Largest delay, cycles."""
@@ -105,6 +111,23 @@ class SetpointReports:
         self.lag = 0
         self.noise = 0.0
         self.measured = False
+        self.spoiled: dict[str, float] = {}
+        """First value of a field of the state, by its name."""
+        self.sag(0.0, 0.0)
+
+    def sag(self, size: float, shake: float) -> None:
+        """Measure each joint ``size`` rad away from where it is, to a random side, and shaking by ``shake`` rad/s."""
+        self._offsets = [self._random.choice((-size, size)) for _ in range(7)]
+        self._shake = shake
+
+    def seen(self, q: Floats, dq: Floats) -> tuple[Floats, Floats]:
+        """Return the measured positions (7,), rad, and speeds (7,), rad/s, that are reported."""
+        if any(self._offsets):
+            q = [x + offset for x, offset in zip(q, self._offsets, strict=True)]
+        if self._shake:
+            self._shake = -self._shake
+            dq = [v + self._shake for v in dq]
+        return q, dq
 
     def shown(self, sample: MotionSample, q: Floats, dq: Floats) -> MotionSample:
         """Return the reported set-point of this cycle.

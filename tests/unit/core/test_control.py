@@ -1,10 +1,12 @@
 """Control sessions through the public interface, on the built-in rig with mock devices in lock-step."""
 
 import itertools
+import math
 import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -280,13 +282,29 @@ def test_a_fault_stops_until_the_user_recovers(rig: hal.Rig, arm: hal.Robot) -> 
         control.send(TURN)
 
 
-def test_impossible_values_from_an_arm_trip(rig: hal.Rig, arm: hal.Robot) -> None:
+@pytest.mark.parametrize(
+    "values", [{"garbage": "nan"}, {"garbage": "inf"}, {"tau_ext": [math.nan] * 7}, {"wrench_ext": [math.inf] * 6}]
+)
+def test_impossible_values_from_an_arm_trip(rig: hal.Rig, arm: hal.Robot, values: dict[str, Any]) -> None:
     with pytest.warns(RuntimeWarning, match="impossible"), arm.control() as control:
         drive(rig, control, count=10)
-        arm.inject(garbage="nan")
+        arm.inject(**values)
         rig.clock.sleep(0.3)
         assert control.trip is Trip.BAD_READING
-        arm.inject(garbage=None)
+        with pytest.raises(hal.StaleStateError):  # no state with such values is ever returned
+            arm.state()
+        arm.inject(**dict.fromkeys(values))
+
+
+def test_a_driver_that_passes_no_set_point_on_is_a_fault_with_a_name(rig: hal.Rig, arm: hal.Robot) -> None:
+    rig.driver("panda").write = lambda setpoint: False
+    with arm.control() as control:
+        begun = rig.clock.now()
+        with pytest.raises(RobotFault) as caught:
+            drive(rig, control, count=50)
+        assert "set-points" in caught.value.cause
+        assert 0.3 < rig.clock.now() - begun < 0.4
+        assert not arm.state().dq_set.any()
 
 
 def test_a_device_that_takes_no_setpoints_is_lost_and_does_not_leap(rig: hal.Rig, arm: hal.Robot) -> None:
