@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .. import registry
-from ..commands import Inbox, Session
+from ..commands import Inbox, Session, SessionRecord
 from ..driver import Reading, RobotDriver
 from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, Fault, NotSupported, RobotFault
 from ..geometry import Pose
@@ -28,7 +28,7 @@ from ..specs import GroupSpec, RobotSpec
 from ..types import RobotStatus
 from .gripper_unit import GripperUnit
 from .guards import guard_arms
-from .records import AppRecord, GripperMail, GroupMemory, Marks, RobotMail, ServoRecord
+from .records import AppRecord, GripperMail, GroupMemory, RobotMail, ServoRecord
 
 __all__ = [
     "ArmUnit",
@@ -187,14 +187,14 @@ class ArmUnit:
             app: The app's newest record.
             late: Whether this process could not run for a while.
         """
-        marks = self.mail.get_marks()
-        if self._session and marks.ended == self._session:  # through memory, so that it waits for no answer
+        said = self.mail.get_session()
+        if said.session != self._session:
             self.servo.close_session()
         if self.error is not None or self.reading is None or self._drives_went_off(self.reading):
             self._prepared = None
-            self._setpoint = self.servo.device_lost(now)
+            self._setpoint = self.servo.device_lost(now, self._inbox(app, said))
             return
-        inbox, self._prepared = self._prepared or self._inbox(app, marks), None
+        inbox, self._prepared = self._prepared or self._inbox(app, said), None
         self._setpoint = self.servo.tick(now, self.reading, inbox, late)
         if self.servo.report.reanchored != self._reanchored:
             self._reanchored = self.servo.report.reanchored
@@ -212,11 +212,12 @@ class ArmUnit:
     def prepare(self, app: AppRecord) -> None:
         """Compute the next set-point ahead, for a device that sets the pace and waits for its answer."""
         if self._setpoint is not None and self.driver.paces_itself:
-            self._prepared = self._inbox(app, self.mail.get_marks())
+            self._prepared = self._inbox(app, self.mail.get_session())
             self.servo.prepare(self._prepared)
 
-    def _inbox(self, app: AppRecord, marks: Marks) -> Inbox:
-        return Inbox(self.mail.get_command(), self.mail.get_deadman(), app.stops, marks.rearms, app.t)
+    def _inbox(self, app: AppRecord, said: SessionRecord) -> Inbox:
+        mail = self.mail
+        return Inbox(mail.get_command(), mail.get_deadman(), app.stops, said.rearms, app.t, said.acknowledged)
 
     def write(self, now: float) -> None:
         """Write the set-point to the device, or switch its drives on where it has to move."""
@@ -266,7 +267,7 @@ class ArmUnit:
 
     def publish(self, now: float) -> None:
         """Publish the newest valid reading, with the state of the servo."""
-        reading, report = self.reading, self.servo.report
+        reading, report, watchdog = self.reading, self.servo.report, self.servo.watchdog
         if reading is not None and self._makes_sense(reading):
             self._sound = reading
         reading = self._sound
@@ -296,6 +297,9 @@ class ArmUnit:
             report.progress,
             report.off_path,
             report.overrun,
+            watchdog.stops,
+            watchdog.rearms,
+            watchdog.allowed,
         )
         self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
 
@@ -320,13 +324,13 @@ class ArmUnit:
         """
         if self._session:
             raise ControlTaken(f"{self.spec.name} is under the control of session {self._session}")
-        if self.mail.get_marks().ended != session.id:
+        if self.mail.get_session().session == session.id:
             self._engage(turn)
-        marks = self.mail.get_marks()
-        if marks.ended == session.id:
+        said = self.mail.get_session()
+        if said.session != session.id:
             return  # the app gave up while this request was on its way
         self._anchor()
-        self.servo.open_session(session, self._inbox(app, marks))
+        self.servo.open_session(session, self._inbox(app, said))
         self._session = session.id
 
     def _engage(self, turn: Callable[[], None]) -> None:

@@ -305,7 +305,7 @@ class GripperContract(Contract):
     def test_a_stop_ends_a_motion_and_keeps_a_grasp(self, bench: GripperBench, hosted: HostedGripper, how: str) -> None:
         def stop() -> None:
             if how == "rig":
-                hosted.host.stop()
+                hosted.host.latch.stop()
             else:
                 hosted.gripper.stop()
 
@@ -328,7 +328,7 @@ class GripperContract(Contract):
 
     def test_a_command_from_before_a_stop_moves_nothing(self, bench: GripperBench, hosted: HostedGripper) -> None:
         hosted.gripper.start(0.0)
-        hosted.host.stop()
+        hosted.host.latch.stop()
         state: GripperState = hosted.run_for(0.3)
         assert (state.target_seq, state.outcome) == (1, GripperOutcome.STOPPED)
         assert state.width == pytest.approx(bench.driver.spec.width_max, abs=_AT)

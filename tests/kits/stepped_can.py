@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from hal.clock import LockStepClock
 from hal.commands import Command
 from hal.config.loader import load
-from hal.deadman import StopLatch
 from hal.drivers.can import damiao_chain, piper_link
 from hal.drivers.can.emulator import console, server
 from hal.errors import ConnectionLost, HalError, MotionStopped, RobotFault
@@ -109,7 +108,7 @@ class SteppedArm:
 
         cycle.step = step_both  # type: ignore[method-assign]
         self.clock = LockStepClock(self.host.now, self.host.advance_to)
-        self.robot = Robot(spec, self.host, self.clock, StopLatch())
+        self.robot = Robot(spec, self.host, self.clock)
         self.driver: Any = cycle.arms[spec.name].driver
         self.control = self.robot.control(rate_hz=50, unattended=True)
 
