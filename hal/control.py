@@ -122,7 +122,8 @@ class Control:
         self._unreported: Trip | None = None
         """The stop that no call has reported when the session began to end; None before."""
         self._detach: Callable[[], None] | None = None
-        self._grip: float | None = None
+        self._grip = (0.0, 0)
+        """Width of the newest command to the gripper, m, and its number; 0 before the first one."""
         self._refused = 0
         self._t_sent = -math.inf
         self._at_once = 0
@@ -497,9 +498,10 @@ class Control:
             reasons.append(gripper.trouble)
         if waiting:
             reasons.append("the dead-man is not held: the gripper does not move")
-        elif self._grip is None or abs(width - self._grip) > gripper.spec.width_max * 0.005:
-            gripper._send(width, gripper.spec.speed, gripper.spec.force)
-            self._grip = width
+            return
+        before, number = self._grip
+        if not number or abs(width - before) > gripper.spec.width_max * 0.005 or gripper._was_stopped(number):
+            self._grip = (width, gripper._send(self._id, width))
 
 
 def _share(name: str, value: float | None, default: float, most: float) -> float:

@@ -194,18 +194,29 @@ class Gripper:
             self._motion = GripperMotion(self, self._put(stops, act, *numbers))
             return self._motion
 
-    def _send(self, width: float, speed: float, force: float) -> None:
-        """Start a motion from a control loop: no error if the gripper does not answer, and no wait."""
-        stops = self._latch.stops
-        if not self._latch.stopped:
-            self._put(stops, GripperAct.MOVE, width, speed, force)
+    def _send(self, session: int, width: float) -> int:
+        """Start a motion from a control loop: no error if the gripper does not answer, and no wait.
 
-    def _put(self, stops: int, act: GripperAct, *numbers: float) -> int:
+        Returns:
+            Its number; 0 after a stop.
+        """
+        stops = self._latch.stops
+        if self._latch.stopped:
+            return 0
+        spec = self.spec
+        return self._put(stops, GripperAct.MOVE, width, spec.speed, spec.force, session=session)
+
+    def _was_stopped(self, number: int) -> bool:
+        """Return whether the newest command is the one of this number, and was stopped before its end."""
+        state = self.newest()
+        return state is not None and state.target_seq == number and state.outcome is GripperOutcome.STOPPED
+
+    def _put(self, stops: int, act: GripperAct, *numbers: float, session: int = 0) -> int:
         with self._sending:
             if self._motion is not None:
                 self._motion._find_result()  # its outcome is lost once the next command is sent
             self._commands += 1
-            self._mail.put_command(GripperCommand(self._commands, stops, act, *numbers))
+            self._mail.put_command(GripperCommand(self._commands, stops, session, act, *numbers))
             return self._commands
 
     # Commands that wait.

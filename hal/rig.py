@@ -192,17 +192,20 @@ class Rig:
         That one is started last, because it mirrors the arms of the others.
         """
         world_host: Host | None = None
+        single = self.lock_step and len(groups) == 1  # needs no memory that another process can read
+        memories = [] if single else [(group, RemoteHost.allocate(group)) for group in groups]
         if self.lock_step:
-            group, *others = groups
-            stepped = [SteppedHost(other, latch=self._latch) for other in others]
+            stepped = [
+                SteppedHost(group, shared=shared, others=[] if group.robots else memories, latch=self._latch)
+                for group, shared in memories[1:]
+            ]
             self._hosts.extend(stepped)
-            local = LocalHost(group, stepped, self._latch)
+            local = LocalHost(groups[0], stepped, self._latch, None if single else memories[0][1])
             self._hosts.insert(0, local)
             self.clock = LockStepClock(local.now, local.advance_to)
-            return local if group.world is not None else None
-        memories = [(group, RemoteHost.allocate(group)) for group in groups]
+            return local if local.spec.world is not None else None
         for group, shared in sorted(memories, key=lambda pair: pair[0].world is not None):
-            seen = group.world is not None or bool(group.neighbours)
+            seen = group.world is not None or bool(group.neighbours) or not group.robots
             others_ = [pair for pair in memories if seen and pair[0] is not group]
             urgent = realtime and bool(group.robots)
             host = RemoteHost(group, realtime=urgent, shared=shared, others=others_, latch=self._latch)

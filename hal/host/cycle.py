@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..kinematics.arm import Kinematics
 from ..servo.audit import SetpointAudit
 from ..servo.controllers import controller_of
 from ..servo.servo import Servo
+from ..servo.watchdog import is_alive
 from ..specs import GroupSpec, RobotSpec
 from ..types import RobotStatus
 from .gripper_unit import GripperUnit
@@ -254,6 +256,10 @@ class ArmUnit:
                 self._lose(error)
         return self._session == 0
 
+    def allowed_session(self, now: float) -> int:
+        """Return the session that may move the arm and its gripper at present; 0 for none."""
+        return self._session if self.servo.watchdog.allowed else 0
+
     def note_latency(self, clock_now: float) -> None:
         """Measure the time from a pad's event to the set-point that follows it, once per command."""
         target = self.servo.report.target_seq
@@ -388,6 +394,15 @@ class ArmUnit:
         self.driver.close()
 
 
+def _allowed_elsewhere(memories: Sequence[GroupMemory], name: str, now: float) -> int:
+    """Return the session that may move an arm of another group at ``now`` (s); 0 for none, or if nothing shows it."""
+    for memory in memories:
+        if name in memory.robots and is_alive(now, memory.get_host().t):
+            servo = memory.robots[name].peek()
+            return servo.session if servo is not None and servo.allowed else 0
+    return 0
+
+
 STOP_LIMIT = 5.0
 """Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 LOWER_LIMIT = 7.0
@@ -425,7 +440,9 @@ class Cycle:
         self.grippers: dict[str, GripperUnit] = {}
         for gripper in spec.grippers:
             driver = registry.load(gripper.driver, "gripper")(gripper, self.world)
-            self.grippers[gripper.name] = GripperUnit(driver, memory.grippers[gripper.name])
+            arm = self.arms.get(gripper.arm)
+            allowed = arm.allowed_session if arm is not None else partial(_allowed_elsewhere, others, gripper.arm)
+            self.grippers[gripper.name] = GripperUnit(driver, memory.grippers[gripper.name], allowed)
         self._gripper_units = tuple(self.grippers.values())
 
     @property
@@ -484,7 +501,7 @@ class Cycle:
             unit.finish_session()
             unit.prepare(app)
         for gripper in self._gripper_units:
-            gripper.serve(app)
+            gripper.serve(now, app)
 
     def publish(self, now: float) -> None:
         """Publish what every device reports."""
@@ -494,7 +511,9 @@ class Cycle:
             gripper.publish(now)
 
     def stop_sessions(self) -> bool:
-        """Bring every arm to rest; call it between steps until it returns True. Grippers keep what they hold."""
+        """Bring everything to rest; call it between steps until it returns True. Grippers keep what they hold."""
+        for gripper in self._gripper_units:
+            gripper.end_motion()
         resting = True
         for unit in self._arm_units:
             if not unit.finish_session():

@@ -147,11 +147,26 @@ class Host(ABC):
 class LocalHost(Host):
     """Lock-step: the cycle runs in this process, whenever the clock is advanced."""
 
-    def __init__(self, spec: GroupSpec, others: Sequence[SteppedHost] = (), latch: StopLatch | None = None) -> None:
-        """Open the devices. ``others`` are groups in processes of their own that keep in step with this one."""
+    def __init__(
+        self,
+        spec: GroupSpec,
+        others: Sequence[SteppedHost] = (),
+        latch: StopLatch | None = None,
+        shared: SharedMemory | None = None,
+    ) -> None:
+        """Open the devices.
+
+        Args:
+            spec: The group.
+            others: Groups in processes of their own that keep in step with this one.
+            latch: The rig's latched stop.
+            shared: Memory that those may read; None if there are none.
+        """
         super().__init__(latch)
         self.spec = spec
-        self.memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
+        self._shared = shared
+        buffer = memoryview(bytearray(GroupMemory.size_of(spec))) if shared is None else shared.buffer
+        self.memory = GroupMemory.of(buffer, spec)
         self._others = others
         self.cycle = Cycle(spec, self.memory, [other.memory for other in others])
         self.cycle.turn = self._step
@@ -192,6 +207,8 @@ class LocalHost(Host):
         for other in self._others:
             other.advance_to(now)
         cycle.step(now, AppRecord(now, self.latch.stops))
+        if self._others:
+            self.publish()
 
     def publish(self) -> None:
         """Publish the present state."""
@@ -224,6 +241,8 @@ class LocalHost(Host):
                     self._step()
             finally:
                 self.cycle.close()
+                if self._shared is not None:
+                    self._shared.close()
 
 
 class RemoteHost(Host):
@@ -244,7 +263,8 @@ class RemoteHost(Host):
             spec: The group.
             realtime: Whether it requests real-time priority.
             shared: Its memory, from :meth:`allocate`; None for a new one.
-            others: Groups whose arms have copies in this one's world, or must not be touched, with their memories.
+            others: Groups whose arms have copies in this one's world, must not be touched, or have this one's gripper,
+                with their memories.
             latch: The rig's latched stop.
         """
         super().__init__(latch)

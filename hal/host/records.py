@@ -220,7 +220,7 @@ def _known(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return None if isnan(values[0]) else values
 
 
-_GRIPPER_COMMAND = "QQB5d"
+_GRIPPER_COMMAND = "QQQB5d"
 _GRIPPER_STATE = "ddQdd?bdQB?"
 _GRIPPER_LAYOUT = struct.Struct("<" + _GRIPPER_STATE + FAULT_FORMAT)
 GRIPPER_STATES = 512
@@ -244,6 +244,8 @@ class GripperCommand(NamedTuple):
     """Number of the command, per gripper, from 1."""
     stops: int
     """Calls of ``rig.stop()`` before it was sent: a later stop ends it before it begins."""
+    session: int
+    """The session of the arm that sent it, and which must be allowed to move; 0 for a command outside of a session."""
     act: GripperAct
     width: float = 0.0
     speed: float = 0.0
@@ -308,8 +310,8 @@ class GripperMail:
 
 
 def _command(values: tuple[Any, ...]) -> GripperCommand:
-    seq, stops, act, *numbers = values
-    return GripperCommand(seq, stops, GripperAct(act), *numbers)
+    seq, stops, session, act, *numbers = values
+    return GripperCommand(seq, stops, session, GripperAct(act), *numbers)
 
 
 def _record(values: tuple[Any, ...]) -> GripperRecord:

@@ -108,7 +108,7 @@ class HostedGripper:
 
     def _run_cycle(self) -> None:
         now = self.bench.pass_time()
-        self.unit.serve(AppRecord(now, self.host.latch.stops))
+        self.unit.serve(now, AppRecord(now, self.host.latch.stops))
         self.unit.publish(now)
 
     def _advance_to(self, t: float) -> None:

@@ -96,7 +96,7 @@ def test_a_grippers_command_and_state_arrive() -> None:
     memory = memoryview(bytearray(GripperMail.size()))
     app, host = GripperMail(memory), GripperMail(memory)
     assert (host.get_command(), app.get()) == (None, None)
-    command = GripperCommand(7, 2, GripperAct.GRASP, 0.03, 0.1, 40.0, 0.004, 0.006)
+    command = GripperCommand(7, 2, 3, GripperAct.GRASP, 0.03, 0.1, 40.0, 0.004, 0.006)
     app.put_command(command)
     assert host.get_command() == command
     fault = Fault("hot", "it is too hot \u2717", "let it cool down")
@@ -124,7 +124,7 @@ def test_mailboxes_of_a_group_do_not_overlap() -> None:
     memory = memoryview(bytearray(GroupMemory.size(robots, grippers)))
     app, host = (GroupMemory(memory, robots, grippers) for _ in range(2))
     for k, name in enumerate(grippers):
-        app.grippers[name].put_command(GripperCommand(k + 1, 0, GripperAct.HOME))
+        app.grippers[name].put_command(GripperCommand(k + 1, 0, 0, GripperAct.HOME))
         host.grippers[name].put(GripperReading(k, k, k, 0.01 * k, 0.0, False))
     app.robots["right"].put_session(SessionRecord(1, 0, 1))
     app.app.write(1.0, 5)
