@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 from engines_kit import need_engine
+from stepped_can import SteppedArm, SteppedEmulator, take_for_off
 
 import hal
 from hal import Deadman, GripperOutcome, registry
@@ -17,18 +20,23 @@ IN_TIME = 0.15
 class Closing:
     """A session whose gripper closes while its dead-man is held."""
 
-    def __init__(self, rig: hal.Rig) -> None:
-        self.rig = rig
-        (self.arm,) = rig.robots.values()
+    def __init__(self, arm: hal.Robot, host: Any, clock: Any, stop: Callable[[], object]) -> None:
+        self.arm, self.host, self.clock, self.stop = arm, host, clock, stop
         assert self.arm.gripper is not None
         self.gripper = self.arm.gripper
         self.deadman = Deadman("the test's dead-man")
         self.held, self.connected = False, True
-        rig._hosts[0].pollers.append(lambda t: self.deadman.update(self.held, self.connected, t))  # type: ignore[attr-defined]
+        host.pollers.append(lambda t: self.deadman.update(self.held, self.connected, t))
+
+    @classmethod
+    def of(cls, rig: hal.Rig) -> Closing:
+        """Return one for a rig with one arm."""
+        (arm,) = rig.robots.values()
+        return cls(arm, rig._hosts[0], rig.clock, rig.stop)
 
     def run(self) -> hal.Control:
         """Open the session, press the dead-man, and close the gripper for a while."""
-        self.rig.clock.sleep(0.1)
+        self.clock.sleep(0.1)
         control = self.arm.control(deadman=self.deadman, rate_hz=50)
         control.__enter__()
         self.press(control)
@@ -36,21 +44,21 @@ class Closing:
 
     def press(self, control: hal.Control) -> None:
         self.held = True
-        self.rig.clock.sleep(0.05)
+        self.clock.sleep(0.05)
         self.send(control)
 
     def send(self, control: hal.Control, seconds: float = 0.2) -> None:
-        end = self.rig.clock.now() + seconds
-        for tick in self.rig.clock.rate(50):
+        end = self.clock.now() + seconds
+        for tick in self.clock.rate(50):
             control.send(hal.JointVelocity([0.05, *[0.0] * (self.arm.n - 1)]), grip=1.0)
             if tick.t >= end:
                 break
 
     def assert_at_rest(self) -> float:
         """Check that the fingers rest in time, not closed; return their width, m."""
-        self.rig.clock.sleep(IN_TIME)
+        self.clock.sleep(IN_TIME)
         width = self.gripper.state().width
-        self.rig.clock.sleep(0.5)
+        self.clock.sleep(0.5)
         state = self.gripper.state()
         assert state.width == pytest.approx(width, abs=1e-3)
         assert 0.2 * self.gripper.width_max < state.width < 0.95 * self.gripper.width_max
@@ -58,14 +66,22 @@ class Closing:
         return state.width
 
 
-@pytest.fixture(params=["mock", *registry.ENGINES])
+@pytest.fixture(params=["mock", *registry.ENGINES, "yam", "piper"])
 def closing(request: pytest.FixtureRequest) -> Iterator[Closing]:
-    options = {"clock": "lock_step", "pad": "none", "overrides": ["cameras={}"]}
-    options |= (
-        {"driver": "mock"} if request.param == "mock" else {"sim": True, "engine": need_engine(request.param).name}
-    )
-    with hal.open("panda_table", **options) as rig:
-        yield Closing(rig)
+    """The gripper of a mock, of a simulated arm, or of an emulated CAN arm, which is stepped with the rig."""
+    kind, options = request.param, {"clock": "lock_step", "pad": "none", "overrides": ["cameras={}"]}
+    with contextlib.ExitStack() as stack:
+        if kind in ("yam", "piper"):
+            far = stack.enter_context(SteppedEmulator(kind))
+            arm = SteppedArm(far, grips=True)
+            stack.callback(arm.host.close)
+            if kind == "yam":
+                stack.callback(take_for_off, arm.driver)
+            arm.robot.gripper.open()
+            yield Closing(arm.robot, arm.host, arm.clock, arm.host.latch.stop)
+            return
+        options |= {"driver": "mock"} if kind == "mock" else {"sim": True, "engine": need_engine(kind).name}
+        yield Closing.of(stack.enter_context(hal.open("panda_table", **options)))
 
 
 def release(closing: Closing, control: hal.Control) -> None:
@@ -78,17 +94,17 @@ def unplug(closing: Closing, control: hal.Control) -> None:
 
 def freeze(closing: Closing, control: hal.Control) -> None:
     """The pad is silent: the arm notices after 120 ms."""
-    closing.rig._hosts[0].pollers.clear()  # type: ignore[attr-defined]
-    closing.send(control, 0.1)
+    closing.host.pollers.clear()
+    closing.send(control, 0.08)
 
 
 def stop(closing: Closing, control: hal.Control) -> None:
-    closing.rig.stop()
+    closing.stop()
 
 
 def trip(closing: Closing, control: hal.Control) -> None:
     """No command comes any more: the arm notices after 100 ms."""
-    closing.rig.clock.sleep(0.1)
+    closing.clock.sleep(0.1)
 
 
 def leave(closing: Closing, control: hal.Control) -> None:
@@ -97,7 +113,7 @@ def leave(closing: Closing, control: hal.Control) -> None:
 
 
 @pytest.mark.parametrize("event", [release, unplug, freeze, stop, trip, leave])
-@pytest.mark.filterwarnings("ignore:panda was stopped")
+@pytest.mark.filterwarnings("ignore:.* was stopped in this session")
 def test_fingers_stop_with_their_session(closing: Closing, event: Callable[[Closing, hal.Control], None]) -> None:
     control = closing.run()
     try:
@@ -111,10 +127,10 @@ def test_fingers_stop_with_their_session(closing: Closing, event: Callable[[Clos
 
 
 @pytest.mark.parametrize("event", [release, unplug, stop, trip, leave])
-@pytest.mark.filterwarnings("ignore:panda was stopped")
+@pytest.mark.filterwarnings("ignore:.* was stopped in this session")
 def test_a_held_object_stays_held(event: Callable[[Closing, hal.Control], None]) -> None:
     with hal.open("panda_table", driver="mock", pad="none", overrides=["cameras={}"]) as rig:
-        closing = Closing(rig)
+        closing = Closing.of(rig)
         closing.gripper.inject(object_width=0.05)
         control = closing.run()
         closing.send(control, 0.5)
