@@ -471,6 +471,7 @@ class Control:
         if self.deadman is not None:
             raise MotionStopped("this session has a dead-man", "release it and press it again", code="deadman_session")
         self._require_open()
+        self._host.check()
         with self._lock:
             self._publish(self._record._replace(acknowledged=self._seen, rearms=self._record.rearms + 1))
         self.robot._latch.acknowledge(self._seen)
