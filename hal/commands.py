@@ -36,9 +36,11 @@ __all__ = [
     "JointVelocity",
     "Kind",
     "NO_INBOX",
+    "NO_SESSION",
     "PathSection",
     "Sent",
     "Session",
+    "SessionRecord",
     "Twist",
     "encode",
 ]
@@ -245,8 +247,6 @@ class Session(NamedTuple):
     """Whether the arm moves only while a dead-man is held."""
     move_to: tuple[float, ...] | None = None
     """Joint positions (n,) to go to and stay, rad; None for a session that follows streamed commands."""
-    stops: int = 0
-    """Number of calls of ``rig.stop()`` that had been acknowledged when the session was opened."""
     controller: dict[str, Any] | None = None
     """Controller that follows the set-point, as :func:`hal.servo.controllers.controller_data` describes it; None for
     the arm's own position controller."""
@@ -269,6 +269,17 @@ class Session(NamedTuple):
             path = tuple(PathSection(tuple(s), tuple(map(tuple, q))) for s, q in path)
             session = session._replace(path=path)
         return session
+
+
+class SessionRecord(NamedTuple):
+    """State of the app's control session, for the servo. The notice of its end waits for no answer."""
+
+    session: int
+    """The session that the app has open; 0 for none."""
+    acknowledged: int
+    """Number of calls of ``rig.stop()`` that its opening, or its last rearm, acknowledged."""
+    rearms: int
+    """Number of calls of ``control.rearm()``."""
 
 
 class CommandRecord(NamedTuple):
@@ -312,8 +323,11 @@ class Inbox(NamedTuple):
     """Number of calls of ``control.rearm()``."""
     t_app: float
     """Time of the program's last heartbeat on the host's clock, s."""
+    acknowledged: int = 0
+    """Number of those stops that the session's opening, or its last rearm, acknowledged."""
 
 
+NO_SESSION = SessionRecord(0, 0, 0)
 NO_INBOX = Inbox(None, None, 0, 0, 0.0)
 
 

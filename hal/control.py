@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import warnings
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from . import registry
 from .arguments import number
 from .commands import (
+    NO_SESSION,
     Command,
     CommandChecks,
     CommandRecord,
@@ -22,6 +24,7 @@ from .commands import (
     PathSection,
     Sent,
     Session,
+    SessionRecord,
     encode,
 )
 from .deadman import Deadman
@@ -107,13 +110,20 @@ class Control:
         self._mail = robot._mail
         self._host = robot._host
         self._id = 0
-        self._stopped = False
+        self._record = NO_SESSION
+        """What the servo is told about this session."""
+        self._opened = 0
+        """Number of the newest state when the session was opened: later ones are of this session."""
+        self._seen = 0
+        """Number of stops that the caller knows of: those that were shown to it as the trip."""
+        self._lock = threading.RLock()
+        """Held while a record is made and sent: any thread may use the session."""
         self._reported = False
         self._unreported: Trip | None = None
         """The stop that no call has reported when the session began to end; None before."""
-        self._rearmed_at = -math.inf
         self._detach: Callable[[], None] | None = None
-        self._grip: float | None = None
+        self._grip = (0.0, 0)
+        """Width of the newest command to the gripper, m, and its number; 0 before the first one."""
         self._refused = 0
         self._t_sent = -math.inf
         self._at_once = 0
@@ -159,24 +169,31 @@ class Control:
             raise ControlTaken(
                 f"{robot.name} is under the control of another session of this program: leave its 'with' block first"
             )
+        self._host.check()
         # The count first: a stop that comes after this line trips the session in its first tick.
-        stops = self._host.stops
+        self._seen = stops = robot._latch.stops
         self._check_latch()
         robot._sessions += 1
         self._id = robot._sessions
         terms = (self.speed, self.tcp_speed, self.deadman is not None)
-        session = Session(self._id, *terms, self._goal, stops, self._law, self._path)
+        session = Session(self._id, *terms, self._goal, self._law, self._path)
         try:
             robot._open = self
+            self._publish(SessionRecord(self._id, stops, 0))
             if self.deadman is not None:
                 self._detach = self.deadman.attach(self._mail.put_deadman)
             self._host.request("begin", {"robot": robot.name, "session": list(session)})
         except BaseException:  # Ctrl-C too: the host may have opened the session, or may still do so
             self._forget()
             raise
-        if self.deadman is not None and self._host.stops == stops:
-            robot._latch.stopped = False
+        self._opened = self._mail.state.seq()
+        robot._latch.acknowledge(stops)
         return self
+
+    def _publish(self, record: SessionRecord) -> None:
+        with self._lock:
+            self._record = record
+            self._mail.put_session(record)
 
     def _check_latch(self) -> None:
         latch = self.robot._latch
@@ -200,7 +217,7 @@ class Control:
         Raises:
             ConnectionLost: The arm did not come to rest in time, or its process is gone.
         """
-        if not self._id:
+        if not self._id or self._host.forked:
             return
         self.brake()
         unreported, self._unreported = self._unreported, None
@@ -218,11 +235,11 @@ class Control:
             found = self._mail.peek()
             known = found is None or found.session != self._id or self._reported
             self._unreported = Trip.NONE if found is None or known else found.trip
-            self._mail.close_session(self._id)  # needs no answer: the arm brakes, whatever happens to this program
+            self._publish(NO_SESSION)  # needs no answer: the arm brakes, whatever happens to this program
 
     def _forget(self) -> None:
         """End the session on this side; the host ends it too if it has not yet."""
-        self._mail.close_session(self._id)
+        self._publish(NO_SESSION)
         self._id = 0
         self.robot._open = None
         if self._detach is not None:
@@ -272,7 +289,14 @@ class Control:
     @property
     def trip(self) -> Trip:
         """Reason for the latched stop; ``Trip.NONE`` if no stop is latched."""
-        return self._peek().trip
+        servo = self._peek()
+        self._note_stops(servo)
+        return servo.trip
+
+    def _note_stops(self, servo: ServoRecord) -> None:
+        """Note that the caller sees this trip: :meth:`rearm` acknowledges no later stop."""
+        if servo.trip is Trip.STOP:
+            self._seen = servo.stops
 
     def _peek(self) -> ServoRecord:
         self._host.check()
@@ -288,16 +312,16 @@ class Control:
         grip: float | None = None,
         width: float | None = None,
         gripper: float | None = None,
-        t_event: float = 0.0,
+        t_event: float | None = None,
     ) -> Sent:
-        """Send a command to the arm, and optionally a grip or a width to its gripper.
+        """Send a command to the arm, and optionally a grip or a width to its gripper. Any thread may call it.
 
         Args:
             command: Target, chunk, velocity, twist, pose or torque, see :mod:`hal.commands`; None leaves the arm alone.
             grip: Grip from 0 (open) to 1 (closed); None leaves the gripper alone.
             width: Distance between the fingers, m, instead of ``grip``.
             gripper: Former name of ``grip``, deprecated.
-            t_event: Time of the pad event behind the command, s, for latency figures.
+            t_event: Time of the pad event behind the command, s, for latency figures; None without one.
 
         Returns:
             What was sent, and the reasons for every difference from ``command``.
@@ -309,6 +333,7 @@ class Control:
             NotSupported: Torques or a grip, for an arm without; nothing is sent.
             MotionStopped: After a trip, until it is acknowledged (see :meth:`rearm`); ``code`` is that of the trip.
             RobotFault: While the robot reports a fault.
+            ControlTaken: The arm does not follow this session any more (``code`` is ``session_ended``).
             ConnectionLost: The process that owns the arm is gone.
         """
         if gripper is not None:
@@ -318,6 +343,7 @@ class Control:
                 stacklevel=2,
             )
         self._require_open()
+        t_event = 0.0 if t_event is None else number("t_event", t_event, "s")
         servo = self._peek()
         now = self.robot.clock.now()
         self._check_trip(servo, now)
@@ -344,11 +370,14 @@ class Control:
             elif servo.status is RobotStatus.HOLDING:
                 self._checks.check_first(command, now, servo.q_set)
             kind, values = encode(command, now)
-            self.robot._commands += 1
             deadline = float(command.t[-1]) if isinstance(command, JointChunk) else now + self._deadline
-            self._mail.put_command(CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event))
+            with self._lock:
+                self.robot._commands += 1
+                record = CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event)
+                self._mail.put_command(record)
         if target is not None:
-            self._send_width(target, waiting, reasons)
+            with self._lock:
+                self._send_width(target, waiting, reasons)
         return Sent(command, tuple(reasons))
 
     def hold_until_following(self) -> bool:
@@ -386,7 +415,16 @@ class Control:
             )
 
     def _check_trip(self, servo: ServoRecord, now: float) -> None:
-        """Raise RobotFault or MotionStopped if the servo has latched a stop that it still holds."""
+        """Raise RobotFault or MotionStopped if the servo has latched a stop that it still holds.
+
+        Raises:
+            ControlTaken: The servo follows no session, or another one.
+        """
+        if servo.session != self._id and self._mail.state.seq() > self._opened and self._peek().session != self._id:
+            raise ControlTaken(
+                f"{self.robot.name} does not follow this session any more: it was closed; open another one",
+                code="session_ended",
+            )
         if servo.status is RobotStatus.FAULT:
             fault = self.robot.state(max_age=math.inf).fault
             self._report_stop()
@@ -394,12 +432,12 @@ class Control:
             raise RobotFault(cause, f"{remedy}; then robot.recover()" if remedy else "call robot.recover()")
         if servo.trip is Trip.NONE:
             self._reported = False
-            if self._stopped:  # acknowledged by a press of the dead-man
-                self._stopped = self.robot._latch.stopped = False
+            if servo.session == self._id:
+                self.robot._latch.acknowledge(servo.stops)  # by a press of the dead-man, or by a rearm
             return
-        if self._rearmed_at > -math.inf and self._mail.state.seq() <= self._rearmed_at:
+        if servo.rearms != self._record.rearms:
             return  # the servo has not handled the rearm yet
-        self._stopped = servo.trip is Trip.STOP
+        self._note_stops(servo)
         self._report_stop()
         remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to continue"
         raise MotionStopped(servo.trip.text + self._details(servo), remedy, code=servo.trip.code)
@@ -421,7 +459,10 @@ class Control:
         return f" ({state.fault.cause})" if state is not None and state.fault is not None else ""
 
     def rearm(self) -> None:
-        """Acknowledge a trip in a session without a dead-man; the arm then follows the next command.
+        """Acknowledge the trip that :meth:`send` raised or :attr:`trip` returned, in a session without a dead-man.
+
+        The arm then follows the next command. A ``rig.stop()`` that came since is not acknowledged: the next ``send``
+        raises it.
 
         Raises:
             MotionStopped: The session has a dead-man: releasing and pressing it again is the acknowledgement (``code``
@@ -429,9 +470,11 @@ class Control:
         """
         if self.deadman is not None:
             raise MotionStopped("this session has a dead-man", "release it and press it again", code="deadman_session")
-        self.robot._latch.stopped = False
-        self._mail.rearm()
-        self._rearmed_at = self._mail.state.seq() + 1
+        self._require_open()
+        self._host.check()
+        with self._lock:
+            self._publish(self._record._replace(acknowledged=self._seen, rearms=self._record.rearms + 1))
+        self.robot._latch.acknowledge(self._seen)
 
     def _finger_width(self, grip: float | None, width: float | None, former: float | None) -> float | None:
         """Return the width in m that ``send`` requests of the gripper, or None; checked before anything is sent."""
@@ -456,9 +499,10 @@ class Control:
             reasons.append(gripper.trouble)
         if waiting:
             reasons.append("the dead-man is not held: the gripper does not move")
-        elif self._grip is None or abs(width - self._grip) > gripper.spec.width_max * 0.005:
-            gripper._send(width, gripper.spec.speed, gripper.spec.force)
-            self._grip = width
+            return
+        before, number = self._grip
+        if not number or abs(width - before) > gripper.spec.width_max * 0.005 or gripper._was_stopped(number):
+            self._grip = (width, gripper._send(self._id, width))
 
 
 def _share(name: str, value: float | None, default: float, most: float) -> float:

@@ -161,10 +161,28 @@ class Deadman:
 
 
 class StopLatch:
-    """Holds a call of ``rig.stop()`` until it is acknowledged."""
+    """Counts the calls of ``rig.stop()``, and holds them until they are acknowledged. Any thread may call it."""
 
     def __init__(self) -> None:
-        self.stopped = False
+        self.stops = 0
+        """Number of calls of :meth:`stop`."""
+        self._acknowledged = 0
+        self._lock = threading.RLock()  # a signal handler may call stop() in the middle of stop()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the newest stop is not acknowledged."""
+        return self._acknowledged < self.stops
+
+    def stop(self) -> None:
+        """Latch a stop."""
+        with self._lock:
+            self.stops += 1
+
+    def acknowledge(self, stops: int) -> None:
+        """Acknowledge the first ``stops`` of all stops; a later one stays latched."""
+        with self._lock:
+            self._acknowledged = max(self._acknowledged, stops)
 
     def check(self) -> None:
         """Raise MotionStopped while the stop is not acknowledged."""

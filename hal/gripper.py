@@ -14,7 +14,6 @@ from .types import GripperOutcome, GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .deadman import StopLatch
     from .host.hosts import Host
     from .specs import GripperSpec
 
@@ -43,13 +42,13 @@ class Gripper:
     MotionStopped if a stop or a newer command came first (``code`` is ``gripper_stopped``), and TimeoutError.
     """
 
-    def __init__(self, spec: GripperSpec, robot: str, host: Host, clock: Clock, latch: StopLatch) -> None:
+    def __init__(self, spec: GripperSpec, robot: str, host: Host, clock: Clock) -> None:
         self.spec = spec
         self.name = spec.name
         self.clock = clock
         self._robot = robot
         self._host = host
-        self._latch = latch
+        self._latch = host.latch
         self._mail = host.memory.grippers[spec.name]
         self._commands = 0
         self._motion: GripperMotion | None = None
@@ -176,7 +175,7 @@ class Gripper:
     def stop(self) -> None:
         """Stop the fingers where they are, with the present force. Returns at once; may be called from any thread."""
         self.check()
-        self._put(self._host.stops, GripperAct.STOP)
+        self._put(self._latch.stops, GripperAct.STOP)
 
     def _checked(self, width: float, speed: float | None, force: float | None) -> tuple[float, float, float]:
         speed = self.spec.speed if speed is None else speed
@@ -188,25 +187,36 @@ class Gripper:
         )
 
     def _start_motion(self, act: GripperAct, *numbers: float) -> GripperMotion:
-        stops = self._host.stops  # before the latch: a stop that comes after this line ends the motion
+        stops = self._latch.stops  # first: a stop that comes after this line ends the motion
         self._latch.check()
         self.check()
         with self._sending:
             self._motion = GripperMotion(self, self._put(stops, act, *numbers))
             return self._motion
 
-    def _send(self, width: float, speed: float, force: float) -> None:
-        """Start a motion from a control loop: no error if the gripper does not answer, and no wait."""
-        stops = self._host.stops
-        if not self._latch.stopped:
-            self._put(stops, GripperAct.MOVE, width, speed, force)
+    def _send(self, session: int, width: float) -> int:
+        """Start a motion from a control loop: no error if the gripper does not answer, and no wait.
 
-    def _put(self, stops: int, act: GripperAct, *numbers: float) -> int:
+        Returns:
+            Its number; 0 after a stop.
+        """
+        stops = self._latch.stops
+        if self._latch.stopped:
+            return 0
+        spec = self.spec
+        return self._put(stops, GripperAct.MOVE, width, spec.speed, spec.force, session=session)
+
+    def _was_stopped(self, number: int) -> bool:
+        """Return whether the newest command is the one of this number, and was stopped before its end."""
+        state = self.newest()
+        return state is not None and state.target_seq == number and state.outcome is GripperOutcome.STOPPED
+
+    def _put(self, stops: int, act: GripperAct, *numbers: float, session: int = 0) -> int:
         with self._sending:
             if self._motion is not None:
                 self._motion._find_result()  # its outcome is lost once the next command is sent
             self._commands += 1
-            self._mail.put_command(GripperCommand(self._commands, stops, act, *numbers))
+            self._mail.put_command(GripperCommand(self._commands, stops, session, act, *numbers))
             return self._commands
 
     # Commands that wait.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import logging
+import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
@@ -130,6 +131,7 @@ class Rig:
         self._devices: dict[str, Any] = {}
         self._observer = Observer(self)
         self._closed = False
+        self._pid = os.getpid()
         atexit.register(self._close_at_exit)
 
     # Opening.
@@ -163,7 +165,7 @@ class Rig:
             self.notes.extend(host.request("warnings"))
             for spec in host.spec.robots:
                 gripper, collisions = self._gripper_of(spec), plan.collisions
-                robot = Robot(spec, host, self.clock, self._latch, gripper, collisions, self.robots)
+                robot = Robot(spec, host, self.clock, gripper, collisions, self.robots)
                 self.robots[spec.name] = robot
         for opened in (self.console, self.viewer3d):
             if opened is not None:
@@ -190,19 +192,23 @@ class Rig:
         That one is started last, because it mirrors the arms of the others.
         """
         world_host: Host | None = None
+        single = self.lock_step and len(groups) == 1  # needs no memory that another process can read
+        memories = [] if single else [(group, RemoteHost.allocate(group)) for group in groups]
         if self.lock_step:
-            group, *others = groups
-            stepped = [SteppedHost(other) for other in others]
+            stepped = [
+                SteppedHost(group, shared=shared, others=[] if group.robots else memories, latch=self._latch)
+                for group, shared in memories[1:]
+            ]
             self._hosts.extend(stepped)
-            local = LocalHost(group, stepped)
+            local = LocalHost(groups[0], stepped, self._latch, None if single else memories[0][1])
             self._hosts.insert(0, local)
             self.clock = LockStepClock(local.now, local.advance_to)
-            return local if group.world is not None else None
-        memories = [(group, RemoteHost.allocate(group)) for group in groups]
+            return local if local.spec.world is not None else None
         for group, shared in sorted(memories, key=lambda pair: pair[0].world is not None):
-            seen = group.world is not None or bool(group.neighbours)
+            seen = group.world is not None or bool(group.neighbours) or not group.robots
             others_ = [pair for pair in memories if seen and pair[0] is not group]
-            host = RemoteHost(group, realtime=realtime and bool(group.robots), shared=shared, others=others_)
+            urgent = realtime and bool(group.robots)
+            host = RemoteHost(group, realtime=urgent, shared=shared, others=others_, latch=self._latch)
             self._hosts.append(host)
             if group.world is not None:
                 world_host = host
@@ -213,7 +219,7 @@ class Rig:
         if spec is None:
             return None
         host = next(host for host in self._hosts if spec in host.spec.grippers)
-        return Gripper(spec, robot.name, host, self.clock, self._latch)
+        return Gripper(spec, robot.name, host, self.clock)
 
     def _open_world_views(self, host: Host, viewer: str) -> None:
         """Open what displays the simulated world: the renderer of its cameras, and a window."""
@@ -356,7 +362,7 @@ class Rig:
     @property
     def stop_count(self) -> int:
         """Number that grows with every call of :meth:`stop`."""
-        return sum(host.stops for host in self._hosts)
+        return self._latch.stops
 
     # Observing and stopping.
 
@@ -392,12 +398,12 @@ class Rig:
     def stop(self) -> None:
         """Stop every arm, within its limits, and latch the stop. May be called from any thread at any time.
 
-        A session continues after ``control.rearm()``, or when its dead-man is released and pressed again; a new session
-        without a dead-man needs :meth:`rearm` first.
+        A session continues after it reported the stop and ``control.rearm()`` was called, or when its dead-man is
+        released and pressed again; a new session without a dead-man needs :meth:`rearm` first.
         """
-        self._latch.stopped = True
+        self._latch.stop()
         for host in self._hosts:
-            host.stop()
+            host.beat()
 
     def say(self, text: str) -> None:
         """Display a line on the console's pages, if there are any."""
@@ -408,8 +414,11 @@ class Rig:
         self.say(f"camera {name} is back" if lost is None else str(lost))
 
     def rearm(self) -> None:
-        """Acknowledge :meth:`stop`, so that sessions without a dead-man can be opened again."""
-        self._latch.stopped = False
+        """Acknowledge every :meth:`stop` so far, so that sessions without a dead-man can be opened again.
+
+        A session that is open stays stopped: it is continued by ``control.rearm()``, or by its dead-man.
+        """
+        self._latch.acknowledge(self._latch.stops)
 
     def _world_edited(self, host: Host, method: str, params: dict[str, Any], revision: int) -> None:
         if method == "add":
@@ -421,7 +430,7 @@ class Rig:
 
     def close(self) -> None:
         """Bring the arms to rest and release every device. Idempotent; the first error is raised at the end."""
-        if self._closed:
+        if self._closed or self._pid != os.getpid():  # what a forked process has copies of is not its own
             return
         errors: list[BaseException] = []
         sessions = [robot._open for robot in self.robots.values() if robot._open is not None]

@@ -25,7 +25,7 @@ from .types import RobotState, RobotStatus
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .deadman import Deadman, StopLatch
+    from .deadman import Deadman
     from .dynamics import Dynamics
     from .gripper import Gripper
     from .host.hosts import Host
@@ -51,7 +51,6 @@ class Robot:
         spec: Record of the arm.
         host: Process, or thread, that runs the arm's servo.
         clock: The rig's clock.
-        latch: The rig's latched stop.
         gripper: Gripper of this arm; None if it has none.
         collisions: What it must not touch.
         others: All arms of the rig, by name.
@@ -62,7 +61,6 @@ class Robot:
         spec: RobotSpec,
         host: Host,
         clock: Clock,
-        latch: StopLatch,
         gripper: Gripper | None = None,
         collisions: CollisionSpec = _NOTHING,
         others: Mapping[str, Robot] | None = None,
@@ -72,7 +70,7 @@ class Robot:
         self.clock = clock
         self._host = host
         self._mail = host.memory.robots[spec.name]
-        self._latch = latch
+        self._latch = host.latch
         self._sessions = 0
         self._commands = 0
         self._open: Control | None = None

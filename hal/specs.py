@@ -103,6 +103,11 @@ class GripperSpec:
     width is proportional to the way of the joints."""
     options: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def arm(self) -> str:
+        """Name of its arm."""
+        return self.name.removesuffix(".gripper")
+
     def finger_positions(self, width: float) -> list[float]:
         """Return the position of each finger joint, rad or m, at a width, m."""
         if not self.opened:

@@ -17,6 +17,8 @@ _AT_REST = 0.15
 """Time without motion after which the fingers are at rest, s."""
 _STILL = 2e-4
 """Largest change of the width of fingers at rest, m."""
+_BLOCKED, _PRESSING = 0.05, 0.5
+"""Fingers press on something that have not moved for so long, s, with this share of the commanded torque."""
 _LARGEST_TORQUE = 5.0
 """Nm."""
 
@@ -49,8 +51,8 @@ class PiperGripper(GripperDriver):
         self._speed = 0.0
         self._torque = 0.0
         self._stopped = True
-        self._t_moved = -inf
-        """Last time at which the fingers moved, or should have, s."""
+        self._t_moved = self._t_still = -inf
+        """Last time at which the fingers moved, or should have, s; and since when they have not moved."""
         self._still_at = 0.0
 
     def open(self) -> None:
@@ -78,7 +80,7 @@ class PiperGripper(GripperDriver):
         if fault is not None:
             self._stopped = True
         if abs(status.width - self._still_at) > _STILL:
-            self._still_at, self._t_moved = status.width, now
+            self._still_at, self._t_moved, self._t_still = status.width, now, now
         self._advance(dt)
         moving = not self._stopped and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
         blocked = status.width - self._goal > self.settings.tolerance
@@ -139,5 +141,10 @@ class PiperGripper(GripperDriver):
     def stop(self) -> None:
         """Keep the fingers where they are; an object that they hold stays held with the same torque."""
         self._link.send(())
-        if self._ramp != self._goal:
-            self._stopped = True
+        status, ramp = self._status, self._ramp
+        if status is None or ramp is None or (ramp == self._goal and self._now - self._t_moved >= _AT_REST):
+            return
+        if abs(status.torque) < _PRESSING * self._torque or self._now - self._t_still < _BLOCKED:
+            ramp = min(max(status.width, 0.0), self.spec.width_max)  # the target is ahead of slow fingers
+            self._send(ramp, clear=False)
+        self._ramp = self._goal = ramp

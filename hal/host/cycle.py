@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from .. import registry
-from ..commands import Inbox, Session
+from ..commands import Inbox, Session, SessionRecord
 from ..driver import Reading, RobotDriver, Setpoint
 from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, Fault, NotSupported, RobotFault
 from ..geometry import Pose
@@ -24,11 +25,12 @@ from ..kinematics.arm import Kinematics
 from ..servo.audit import SetpointAudit
 from ..servo.controllers import controller_of
 from ..servo.servo import Servo
+from ..servo.watchdog import is_alive
 from ..specs import GroupSpec, RobotSpec
 from ..types import RobotStatus
 from .gripper_unit import GripperUnit
 from .guards import guard_arms
-from .records import AppRecord, GripperMail, GroupMemory, Marks, RobotMail, ServoRecord
+from .records import AppRecord, GripperMail, GroupMemory, RobotMail, ServoRecord
 
 __all__ = [
     "ArmUnit",
@@ -187,17 +189,17 @@ class ArmUnit:
             app: The app's newest record.
             late: Whether this process could not run for a while.
         """
-        marks = self.mail.get_marks()
-        if self._session and marks.ended == self._session:  # through memory, so that it waits for no answer
+        said = self.mail.get_session()
+        if said.session != self._session:
             self.servo.close_session()
         if self.error is not None or self.reading is None or self._drives_went_off(self.reading):
-            self._setpoint, self._answered = self.servo.device_lost(now), False
+            self._setpoint, self._answered = self.servo.device_lost(now, self._inbox(app, said)), False
             return
         ahead = self.servo.answer(now, self.reading)
         self._answered = ahead is not None
         if ahead is not None:  # the device waits for it
             self._pass_on(ahead, now)
-        self._setpoint = self.servo.tick(now, self.reading, self._inbox(app, marks), late)
+        self._setpoint = self.servo.tick(now, self.reading, self._inbox(app, said), late)
         if self.servo.report.reanchored != self._reanchored:
             self._reanchored = self.servo.report.reanchored
             self.reanchored += 1
@@ -211,8 +213,9 @@ class ArmUnit:
         before, self._engaged = self._engaged, self.driver.engaged
         return before and not self._engaged and reading.fault is None
 
-    def _inbox(self, app: AppRecord, marks: Marks) -> Inbox:
-        return Inbox(self.mail.get_command(), self.mail.get_deadman(), app.stops, marks.rearms, app.t)
+    def _inbox(self, app: AppRecord, said: SessionRecord) -> Inbox:
+        mail = self.mail
+        return Inbox(mail.get_command(), mail.get_deadman(), app.stops, said.rearms, app.t, said.acknowledged)
 
     def write(self, now: float) -> None:
         """Write the set-point to the device, or switch its drives on where it has to move."""
@@ -250,6 +253,10 @@ class ArmUnit:
                 self._lose(error)
         return self._session == 0
 
+    def allowed_session(self, now: float) -> int:
+        """Return the session that may move the arm and its gripper at present; 0 for none."""
+        return self._session if self.servo.watchdog.allowed else 0
+
     def note_latency(self, clock_now: float) -> None:
         """Measure the time from a pad's event to the set-point that follows it, once per command."""
         target = self.servo.report.target_seq
@@ -263,7 +270,7 @@ class ArmUnit:
 
     def publish(self, now: float) -> None:
         """Publish the newest valid reading, with the state of the servo."""
-        reading, report = self.reading, self.servo.report
+        reading, report, watchdog = self.reading, self.servo.report, self.servo.watchdog
         if reading is not None and self._makes_sense(reading):
             self._sound = reading
         reading = self._sound
@@ -293,6 +300,9 @@ class ArmUnit:
             report.progress,
             report.off_path,
             report.overrun,
+            watchdog.stops,
+            watchdog.rearms,
+            watchdog.allowed,
         )
         self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
 
@@ -318,13 +328,13 @@ class ArmUnit:
         """
         if self._session:
             raise ControlTaken(f"{self.spec.name} is under the control of session {self._session}")
-        if self.mail.get_marks().ended != session.id:
+        if self.mail.get_session().session == session.id:
             self._engage(turn)
-        marks = self.mail.get_marks()
-        if marks.ended == session.id:
+        said = self.mail.get_session()
+        if said.session != session.id:
             return  # the app gave up while this request was on its way
         self._anchor()
-        self.servo.open_session(session, self._inbox(app, marks))
+        self.servo.open_session(session, self._inbox(app, said))
         self._session = session.id
 
     def _engage(self, turn: Callable[[], None]) -> None:
@@ -382,6 +392,15 @@ class ArmUnit:
         self.driver.close()
 
 
+def _allowed_elsewhere(memories: Sequence[GroupMemory], name: str, now: float) -> int:
+    """Return the session that may move an arm of another group at ``now`` (s); 0 for none, or if nothing shows it."""
+    for memory in memories:
+        if name in memory.robots and is_alive(now, memory.get_host().t):
+            servo = memory.robots[name].peek()
+            return servo.session if servo is not None and servo.allowed else 0
+    return 0
+
+
 STOP_LIMIT = 5.0
 """Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 LOWER_LIMIT = 7.0
@@ -419,7 +438,9 @@ class Cycle:
         self.grippers: dict[str, GripperUnit] = {}
         for gripper in spec.grippers:
             driver = registry.load(gripper.driver, "gripper")(gripper, self.world)
-            self.grippers[gripper.name] = GripperUnit(driver, memory.grippers[gripper.name])
+            arm = self.arms.get(gripper.arm)
+            allowed = arm.allowed_session if arm is not None else partial(_allowed_elsewhere, others, gripper.arm)
+            self.grippers[gripper.name] = GripperUnit(driver, memory.grippers[gripper.name], allowed)
         self._gripper_units = tuple(self.grippers.values())
 
     @property
@@ -477,7 +498,7 @@ class Cycle:
             unit.write(now)
             unit.finish_session()
         for gripper in self._gripper_units:
-            gripper.serve(app)
+            gripper.serve(now, app)
 
     def publish(self, now: float) -> None:
         """Publish what every device reports."""
@@ -487,7 +508,9 @@ class Cycle:
             gripper.publish(now)
 
     def stop_sessions(self) -> bool:
-        """Bring every arm to rest; call it between steps until it returns True. Grippers keep what they hold."""
+        """Bring everything to rest; call it between steps until it returns True. Grippers keep what they hold."""
+        for gripper in self._gripper_units:
+            gripper.end_motion()
         resting = True
         for unit in self._arm_units:
             if not unit.finish_session():

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import traceback
+from collections.abc import Callable
 
 from ..driver import GripperDriver, GripperReading
 from ..errors import CommandError, ConfigError, ConnectionLost, DriverMissing, Fault, HalError, NotSupported, RobotFault
+from ..servo.watchdog import SILENCE, is_alive
 from ..types import GripperOutcome
 from .records import AppRecord, GripperAct, GripperCommand, GripperMail
 
@@ -18,10 +20,19 @@ _SWITCH_ON = "check that it is on and connected"
 
 
 class GripperUnit:
-    """A gripper with its mailboxes. Its errors are reported in its state and stop nothing else."""
+    """A gripper with its mailboxes. Its errors are reported in its state and stop nothing else.
 
-    def __init__(self, driver: GripperDriver, mail: GripperMail) -> None:
+    Args:
+        driver: The driver.
+        mail: Its mailboxes.
+        allowed_session: Returns the session of the arm that may move at a time (s), 0 for none.
+    """
+
+    def __init__(
+        self, driver: GripperDriver, mail: GripperMail, allowed_session: Callable[[float], int] = lambda now: 0
+    ) -> None:
         self.driver = driver
+        self._allowed_session = allowed_session
         self.spec = driver.spec
         self.mail = mail
         self._reading: GripperReading | None = None
@@ -35,6 +46,8 @@ class GripperUnit:
         self._fault: Fault | None = None
         """Fault of the newest command, if its call failed."""
         self._stops = 0
+        self._waiting: tuple[int, float] = (0, 0.0)
+        """Number of the newest command whose session did not move yet, and when it was seen first, s."""
         self._reason = ""
 
     def open(self) -> None:
@@ -56,22 +69,44 @@ class GripperUnit:
 
     # Per cycle.
 
-    def serve(self, app: AppRecord) -> None:
-        """Stop the fingers if the app stopped the rig; start the newest command of the app.
+    def serve(self, now: float, app: AppRecord) -> None:
+        """Stop the fingers if the app stopped the rig, or they may not move any more; start the app's newest command.
 
         A command that was sent before a stop, or that the gripper does not accept, is dropped: nothing moves later.
+
+        Args:
+            now: Time on the group's clock, s.
+            app: The app's newest record.
         """
         if app.stops != self._stops:
             self._stops = app.stops
             self._stop(self._outcome is GripperOutcome.RUNNING)
+        elif self._command is not None and not self._may_move(self._command, now, app):
+            self.end_motion()
         command = self.mail.get_command()
         if command is None or command.seq <= self._seq:
             return
-        self._seq = command.seq
         if command.stops < app.stops:
+            self._seq = command.seq
             self._end(GripperOutcome.STOPPED)
-        else:
+        elif command.act is GripperAct.STOP or self._may_move(command, now, app):
+            self._seq = command.seq
             self._take(command)
+        elif self._waiting[0] != command.seq:
+            self._waiting = command.seq, now
+        elif now - self._waiting[1] > SILENCE:
+            self._seq = command.seq
+            self.end_motion()
+            self._end(GripperOutcome.STOPPED)
+
+    def _may_move(self, command: GripperCommand, now: float, app: AppRecord) -> bool:
+        """Return whether the app is alive, and the session that sent a command may move."""
+        return is_alive(now, app.t) and command.session in (0, self._allowed_session(now))
+
+    def end_motion(self) -> None:
+        """Stop the fingers if they move; they keep what they hold."""
+        if self._outcome is GripperOutcome.RUNNING:
+            self._stop(True)
 
     def _take(self, command: GripperCommand) -> None:
         if command.act is GripperAct.STOP:

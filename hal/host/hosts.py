@@ -5,6 +5,7 @@ Both look the same to the public classes: mailboxes in memory, requests, and a c
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -13,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from .. import registry
+from ..deadman import StopLatch
 from ..errors import ConnectionLost, HalError
 from ..specs import GripperSpec, GroupSpec, RobotSpec, to_json
 from .cycle import STOP_LIMIT, Cycle
@@ -114,10 +116,14 @@ class Host(ABC):
     spec: GroupSpec
     memory: GroupMemory
 
+    def __init__(self, latch: StopLatch | None = None) -> None:
+        self.latch = StopLatch() if latch is None else latch
+        """The rig's latched stop."""
+
     @property
-    @abstractmethod
-    def stops(self) -> int:
-        """Number of calls of :meth:`stop`."""
+    def forked(self) -> bool:
+        """Whether this is a copy in a forked process, whose end must not be that of the original's sessions."""
+        return False
 
     @abstractmethod
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
@@ -127,9 +133,8 @@ class Host(ABC):
     def check(self) -> None:
         """Raise ConnectionLost if the group's process is gone."""
 
-    @abstractmethod
-    def stop(self) -> None:
-        """Latch a stop of every arm. Any thread may call it, at any time."""
+    def beat(self) -> None:  # noqa: B027  # in lock-step every cycle has them
+        """Send the app's sign of life and the number of stops now. Any thread may call it, at any time."""
 
     def request_close(self) -> None:  # noqa: B027  # most have nothing to do before
         """Begin to close, without waiting, where that is possible: the hosts of a rig close at the same time."""
@@ -142,16 +147,31 @@ class Host(ABC):
 class LocalHost(Host):
     """Lock-step: the cycle runs in this process, whenever the clock is advanced."""
 
-    def __init__(self, spec: GroupSpec, others: Sequence[SteppedHost] = ()) -> None:
-        """Open the devices. ``others`` are groups in processes of their own that keep in step with this one."""
+    def __init__(
+        self,
+        spec: GroupSpec,
+        others: Sequence[SteppedHost] = (),
+        latch: StopLatch | None = None,
+        shared: SharedMemory | None = None,
+    ) -> None:
+        """Open the devices.
+
+        Args:
+            spec: The group.
+            others: Groups in processes of their own that keep in step with this one.
+            latch: The rig's latched stop.
+            shared: Memory that those may read; None if there are none.
+        """
+        super().__init__(latch)
         self.spec = spec
-        self.memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
+        self._shared = shared
+        buffer = memoryview(bytearray(GroupMemory.size_of(spec))) if shared is None else shared.buffer
+        self.memory = GroupMemory.of(buffer, spec)
         self._others = others
         self.cycle = Cycle(spec, self.memory, [other.memory for other in others])
         self.cycle.turn = self._step
         self.pollers: list[Callable[[float], object]] = []
         """Functions (pads) that are called with the time, every :data:`PAD_PERIOD` of simulated time."""
-        self._stops = 0
         self._busy = threading.RLock()
         """Held while time advances: in one thread only."""
         self._next_poll = 0.0
@@ -186,7 +206,9 @@ class LocalHost(Host):
             self._next_poll = now + PAD_PERIOD
         for other in self._others:
             other.advance_to(now)
-        cycle.step(now, AppRecord(now, self._stops))
+        cycle.step(now, AppRecord(now, self.latch.stops))
+        if self._others:
+            self.publish()
 
     def publish(self) -> None:
         """Publish the present state."""
@@ -203,16 +225,9 @@ class LocalHost(Host):
                 self.publish()
             return result
 
-    @property
-    def stops(self) -> int:
-        return self._stops
-
     def check(self) -> None:
         if self._closed:
             raise HalError("the rig is closed", code="closed")
-
-    def stop(self) -> None:
-        self._stops += 1  # not under the lock: its holder may be what is to be stopped
 
     def close(self) -> None:
         with self._busy:
@@ -226,6 +241,8 @@ class LocalHost(Host):
                     self._step()
             finally:
                 self.cycle.close()
+                if self._shared is not None:
+                    self._shared.close()
 
 
 class RemoteHost(Host):
@@ -238,6 +255,7 @@ class RemoteHost(Host):
         realtime: bool = False,
         shared: SharedMemory | None = None,
         others: Sequence[tuple[GroupSpec, SharedMemory]] = (),
+        latch: StopLatch | None = None,
     ) -> None:
         """Start the process.
 
@@ -245,9 +263,13 @@ class RemoteHost(Host):
             spec: The group.
             realtime: Whether it requests real-time priority.
             shared: Its memory, from :meth:`allocate`; None for a new one.
-            others: Groups whose arms have copies in this one's world, or must not be touched, with their memories.
+            others: Groups whose arms have copies in this one's world, must not be touched, or have this one's gripper,
+                with their memories.
+            latch: The rig's latched stop.
         """
+        super().__init__(latch)
         self.spec = spec
+        self._pid = os.getpid()
         self.snapshot_offset = GroupMemory.size_of(spec)
         self.shared = self.allocate(spec) if shared is None else shared
         self.memory = GroupMemory.of(self.shared.buffer, spec)
@@ -255,13 +277,12 @@ class RemoteHost(Host):
         config["others"] = [to_json(other) for other, _ in others]
         memories = [self.shared, *(memory for _, memory in others)]
         self.child = Child(spec.name, "hal.host.main:main", config, memories)
-        self._stops = 0
         self._close_by: float | None = None
         """Time at which the process is killed, s; None before it was asked to close."""
         self._asking = threading.Lock()
-        self._writing = threading.RLock()  # a signal handler may call stop() in the middle of stop()
+        self._writing = threading.RLock()  # a signal handler may stop the rig in the middle of a beat
         self._closed = threading.Event()
-        self._beat()
+        self.beat()
         self._thread = threading.Thread(target=self._heartbeat, name=f"hal-heartbeat-{spec.name}", daemon=True)
         self._thread.start()
 
@@ -276,23 +297,32 @@ class RemoteHost(Host):
         """Wait until every device is open. Raises the error that stopped one of them."""
         return self.child.wait_ready()
 
-    def _beat(self) -> None:
+    @property
+    def forked(self) -> bool:
+        return os.getpid() != self._pid
+
+    def beat(self) -> None:
+        if self.forked:
+            raise self._not_ours()
         with self._writing:
-            self.memory.app.write(time.monotonic(), self._stops)
+            self.memory.app.write(time.monotonic(), self.latch.stops)
 
     def _heartbeat(self) -> None:
         while not self._closed.wait(HEARTBEAT):
-            self._beat()
+            self.beat()
+
+    @staticmethod
+    def _not_ours() -> HalError:
+        text = "this rig belongs to the process that opened it, of which this one is a fork: open a rig of its own here"
+        return HalError(text, code="forked")
 
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
         with self._asking:  # one at a time: no other request runs in the middle of the cycles of an "advance"
             return self.child.request(method, params)
 
-    @property
-    def stops(self) -> int:
-        return self._stops
-
     def check(self) -> None:
+        if self.forked:
+            raise self._not_ours()
         if self._closed.is_set():
             raise HalError("the rig is closed", code="closed")
         self.child.check()
@@ -307,11 +337,6 @@ class RemoteHost(Host):
         host = self.memory.get_host()
         return time.monotonic() - host.t if host.ready and not self.child.busy else 0.0
 
-    def stop(self) -> None:
-        with self._writing:
-            self._stops += 1
-            self.memory.app.write(time.monotonic(), self._stops)
-
     def request_close(self) -> None:
         if self._close_by is None and not self._closed.is_set():
             lasts = STOP_LIMIT + CLOSE_LIMIT * max(1, len(self.spec.robots))
@@ -319,7 +344,7 @@ class RemoteHost(Host):
             self.child.request_close()
 
     def close(self) -> None:
-        if self._closed.is_set():
+        if self._closed.is_set() or self.forked:
             return
         RemoteHost.request_close(self)
         assert self._close_by is not None

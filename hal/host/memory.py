@@ -32,7 +32,7 @@ _TRIES = 16
 class _Slots:
     """Memory of slots with ``capacity`` payload bytes each (a power of two of them), and the number of the newest."""
 
-    __slots__ = ("_announced", "_buffer", "_mask", "_payloads", "_seen", "_seq", "_starts")
+    __slots__ = ("_announced", "_buffer", "_mask", "_payloads", "_seq", "_starts")
 
     def __init__(self, buffer: memoryview, capacity: int, slots: int = 2) -> None:
         stride = self._stride(capacity)
@@ -42,7 +42,6 @@ class _Slots:
         self._starts = tuple(_HEADER + k * stride for k in range(slots))
         self._payloads = tuple(self._buffer[s + _SLOT.size : s + _SLOT.size + capacity] for s in self._starts)
         self._seq: int = self._announced[0]
-        self._seen = 0
 
     @staticmethod
     def _stride(capacity: int) -> int:
@@ -77,14 +76,14 @@ class _Slots:
 class Mailbox(_Slots):
     """Records of one fixed ``layout``, a :mod:`struct` format without a byte-order mark.
 
-    One process writes, in one thread; everyone may read, each reader through a Mailbox of its own.
+    One process writes, in one thread at a time; everyone may read, each process through a Mailbox of its own.
     """
 
-    __slots__ = ("_layout", "_record")
+    __slots__ = ("_layout", "_newest")
 
     def __init__(self, buffer: memoryview, layout: str, slots: int = 2) -> None:
         self._layout = struct.Struct("<" + layout)
-        self._record = b""
+        self._newest: tuple[int, bytes] | None = None  # replaced as one: several threads may read
         super().__init__(buffer, self._layout.size, slots)
 
     @classmethod
@@ -107,15 +106,16 @@ class Mailbox(_Slots):
 
     def read_bytes(self) -> tuple[int, bytes] | None:
         """Return the same, not unpacked."""
+        newest = self._newest
         for _ in range(_TRIES):
             seq = self._announced[0]
-            if seq == self._seen:
+            if seq == (newest[0] if newest is not None else 0):
                 break
             record = self.bytes_at(seq)
             if record is not None:
-                self._seen, self._record = seq, record
+                self._newest = newest = (seq, record)
                 break
-        return (self._seen, self._record) if self._seen else None
+        return newest
 
     def bytes_at(self, seq: int) -> bytes | None:
         """Return the whole record of this number, not unpacked; None if it is not there yet, or not any more."""
@@ -136,11 +136,11 @@ _SERIES = struct.Struct("<dQQ")  # time, revision, count
 class SeriesBox(_Slots):
     """A time, a revision and a series of numbers whose length may change from record to record, up to ``capacity``."""
 
-    __slots__ = ("_capacity", "_record")
+    __slots__ = ("_capacity", "_newest")
 
     def __init__(self, buffer: memoryview, capacity: int) -> None:
         self._capacity = capacity
-        self._record: tuple[float, int, array[float]] = (0.0, 0, array("d"))
+        self._newest: tuple[int, float, int, array[float]] | None = None  # replaced as one
         super().__init__(buffer, _SERIES.size + 8 * capacity)
 
     @classmethod
@@ -161,9 +161,10 @@ class SeriesBox(_Slots):
 
     def read(self) -> tuple[int, float, int, array[float]] | None:
         """Return the newest whole record as (number, time, revision, values); None before the first one."""
+        newest = self._newest
         for _ in range(_TRIES):
             seq = self._announced[0]
-            if seq == self._seen:
+            if seq == (newest[0] if newest is not None else 0):
                 break
             which = seq & self._mask
             number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
@@ -171,11 +172,10 @@ class SeriesBox(_Slots):
             if count > self._capacity:
                 continue  # torn
             payload = bytes(self._payloads[which][: _SERIES.size + 8 * count])
-            if number == seq and crc32(payload) == check:
-                self._seen = seq
-                self._record = (t, revision, array("d", payload[_SERIES.size :]))
+            if number == seq > 0 and crc32(payload) == check:
+                self._newest = newest = (seq, t, revision, array("d", payload[_SERIES.size :]))
                 break
-        return (self._seen, *self._record) if self._seen else None
+        return newest
 
 
 Raw = TypeVar("Raw")

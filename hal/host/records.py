@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import struct
-import threading
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from math import isnan, nan
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..commands import CHUNK_POINTS, CommandRecord, DeadmanRecord, Kind
+from ..commands import CHUNK_POINTS, NO_SESSION, CommandRecord, DeadmanRecord, Kind, SessionRecord
 from ..driver import Reading
 from ..errors import Fault
 from ..geometry import Pose
@@ -37,7 +36,6 @@ __all__ = [
     "GripperRecord",
     "GroupMemory",
     "HostRecord",
-    "Marks",
     "RobotMail",
     "ServoRecord",
     "StateLayout",
@@ -72,7 +70,7 @@ def fault_at(record: bytes, offset: int) -> Fault | None:
 
 
 _STAMP = struct.Struct("<ddQ")
-_SERVO = struct.Struct("<iiiQQ?Qddiid?i")
+_SERVO = struct.Struct("<iiiQQ?Qddiid?iQQ?")
 _CONTROLLERS = {int(mode): mode for mode in ControlMode}
 _STATUSES = {int(status): status for status in RobotStatus}
 _TRIPS = {int(trip): trip for trip in Trip}
@@ -106,6 +104,12 @@ class ServoRecord(NamedTuple):
     """Whether the arm cannot continue on the path of that motion: it was moved too far off, or no plan leads on."""
     overrun: Limited = Limited.NONE
     """Limit that the arm reached when ``Trip.LIMIT`` was latched; ``NONE`` if it could not be braked."""
+    stops: int = 0
+    """Number of calls of ``rig.stop()`` that :attr:`trip` takes into account."""
+    rearms: int = 0
+    """Number of rearms that were handled."""
+    allowed: bool = False
+    """Whether the session may move the arm and its gripper."""
 
 
 class StateLayout:
@@ -163,30 +167,29 @@ class StateLayout:
             *(servo.tau_set or nothing),
             *servo[:9],  # all but the set-points
             servo.controller,
-            servo.held_back,
-            servo.progress,
-            servo.off_path,
-            servo.overrun,
+            *servo[13:],  # what follows the torques
             *fault_values(reading.fault),
         )
 
     def servo(self, record: bytes) -> ServoRecord:
         """Return the servo's part of a record."""
-        *rest, controller, held_back, progress, off_path, overrun = _SERVO.unpack_from(record, self._servo_at)
+        values = _SERVO.unpack_from(record, self._servo_at)
+        status, trip, limited, *rest = values[:9]
+        controller, held_back, progress, off_path, overrun, *end = values[9:]
         sets = self._set_points.unpack_from(record, self._set_at)
-        status, trip, limited, *rest = rest
         n, first = self.n, (_STATUSES[status], _TRIPS[trip], _limited(limited))
-        motion = (_limited(held_back), progress, off_path, _limited(overrun))
+        motion = (_limited(held_back), progress, off_path, _limited(overrun), *end)
         return ServoRecord._make((*first, *rest, sets[:n], sets[n:], _CONTROLLERS[controller], (), *motion))
 
     def state(self, record: bytes) -> RobotState:
         """Return the whole state in a record."""
         n, end = self.n, self._servo_at
         numbers: NDArray[np.float64] = np.frombuffer(record, "<f8", self._count, _STAMP.size)
-        status, trip, limited, target_seq, *_, controller, _, _, _, _ = _SERVO.unpack_from(record, end)
+        status, trip, limited, target_seq, *rest = _SERVO.unpack_from(record, end)
+        controller = _CONTROLLERS[rest[5]]
         tau = numbers[2 * n : 3 * n]
-        rest = numbers[5 * n :]
-        tau_ext, wrench_ext, tau_set = rest[20 : 20 + n], rest[20 + n : 26 + n], rest[26 + n :]
+        tail = numbers[5 * n :]
+        tau_ext, wrench_ext, tau_set = tail[20 : 20 + n], tail[20 + n : 26 + n], tail[26 + n :]
         return RobotState(
             stamp=Stamp(*_STAMP.unpack_from(record, 0)),
             q=numbers[:n],
@@ -194,9 +197,9 @@ class StateLayout:
             tau=_known(tau),
             q_set=numbers[3 * n : 4 * n],
             dq_set=numbers[4 * n : 5 * n],
-            tcp=Pose.trusted(rest[:3], rest[3:7]),
-            tcp_set=Pose.trusted(rest[7:10], rest[10:14]),
-            tcp_twist=rest[14:20],
+            tcp=Pose.trusted(tail[:3], tail[3:7]),
+            tcp_set=Pose.trusted(tail[7:10], tail[10:14]),
+            tcp_twist=tail[14:20],
             tau_ext=_known(tau_ext),
             wrench_ext=_known(wrench_ext),
             status=_STATUSES[status],
@@ -204,7 +207,7 @@ class StateLayout:
             fault=fault_at(record, end + _SERVO.size),
             limited=_limited(limited),
             target_seq=target_seq,
-            controller=_CONTROLLERS[controller],
+            controller=controller,
             tau_set=_known(tau_set),
         )
 
@@ -217,7 +220,7 @@ def _known(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return None if isnan(values[0]) else values
 
 
-_GRIPPER_COMMAND = "QQB5d"
+_GRIPPER_COMMAND = "QQQB5d"
 _GRIPPER_STATE = "ddQdd?bdQB?"
 _GRIPPER_LAYOUT = struct.Struct("<" + _GRIPPER_STATE + FAULT_FORMAT)
 GRIPPER_STATES = 512
@@ -241,6 +244,8 @@ class GripperCommand(NamedTuple):
     """Number of the command, per gripper, from 1."""
     stops: int
     """Calls of ``rig.stop()`` before it was sent: a later stop ends it before it begins."""
+    session: int
+    """The session of the arm that sent it, and which must be allowed to move; 0 for a command outside of a session."""
     act: GripperAct
     width: float = 0.0
     speed: float = 0.0
@@ -305,8 +310,8 @@ class GripperMail:
 
 
 def _command(values: tuple[Any, ...]) -> GripperCommand:
-    seq, stops, act, *numbers = values
-    return GripperCommand(seq, stops, GripperAct(act), *numbers)
+    seq, stops, session, act, *numbers = values
+    return GripperCommand(seq, stops, session, GripperAct(act), *numbers)
 
 
 def _record(values: tuple[Any, ...]) -> GripperRecord:
@@ -355,18 +360,6 @@ class HostRecord(NamedTuple):
     ready: bool
 
 
-class Marks(NamedTuple):
-    """Rare notices from the app to one servo."""
-
-    rearms: int
-    """Number of calls of ``control.rearm()``."""
-    ended: int
-    """Newest session that the app closed."""
-
-
-_NO_MARKS = Marks(0, 0)
-
-
 class RobotMail:
     """The mailboxes of one arm with ``n`` joints."""
 
@@ -378,7 +371,7 @@ class RobotMail:
         for layout, slots in self.layouts(n):
             boxes.append(Mailbox(buffer[offset:], layout, slots))
             offset += Mailbox.size(layout, slots)
-        self.command, self.deadman, self.marks, self.state = boxes
+        self.command, self.deadman, self.session, self.state = boxes
         self._chunk = SeriesBox(buffer[offset:], _chunk_capacity(n))
         state = self.state
         self.get_command = newest(self.command, self._command)
@@ -391,14 +384,13 @@ class RobotMail:
         """Returns only the servo's part of the newest state: for every ``send``."""
         self.history = History(state, self._layout.state)
         """The last :data:`STATES` states."""
-        self._newest_marks = newest(self.marks, Marks._make)
-        self._marking = threading.Lock()
+        self._newest_session = newest(self.session, SessionRecord._make)
 
     @staticmethod
     def layouts(n: int) -> tuple[tuple[str, int], ...]:
         """Return formats and numbers of slots of the mailboxes, in their order in memory."""
         width = max(2 * n, 7)
-        return ((f"QddidQH{width}d", 2), (_DEADMAN, 2), ("QQ", 2), (StateLayout(n).format, STATES))
+        return ((f"QddidQH{width}d", 2), (_DEADMAN, 2), ("QQQ", 2), (StateLayout(n).format, STATES))
 
     @classmethod
     def size(cls, n: int) -> int:
@@ -429,20 +421,13 @@ class RobotMail:
         """Publish the state of the dead-man."""
         self.deadman.write(record.held, record.connected, record.presses, record.t_alive)
 
-    def get_marks(self) -> Marks:
-        """Return the newest rearms and closed session."""
-        return self._newest_marks() or _NO_MARKS
+    def put_session(self, record: SessionRecord) -> None:
+        """Publish the state of the app's session."""
+        self.session.write(*record)
 
-    def rearm(self) -> None:
-        """Count one more call of ``control.rearm()``."""
-        with self._marking:
-            marks = self.get_marks()
-            self.marks.write(marks.rearms + 1, marks.ended)
-
-    def close_session(self, session: int) -> None:
-        """Mark this session as closed."""
-        with self._marking:
-            self.marks.write(self.get_marks().rearms, session)
+    def get_session(self) -> SessionRecord:
+        """Return the newest state of the app's session."""
+        return self._newest_session() or NO_SESSION
 
     def _command(self, values: tuple[Any, ...]) -> CommandRecord:
         seq, t, deadline, kind, t_event, session, count, *rest = values

@@ -55,7 +55,7 @@ class ArmMotion:
     def __init__(self, robot: Robot, session: Control) -> None:
         self._robot = robot
         self._session = session
-        self._id = self._opened = 0
+        self._id = 0
         self._result: ArmMotionResult | None = None
         self._cancelled = False
 
@@ -128,7 +128,6 @@ class ArmMotion:
     def _start(self) -> ArmMotion:
         self._session.__enter__()
         self._id = self._session._id
-        self._opened = self._robot._mail.state.seq()
         self._robot._motion = self
         return self
 
@@ -148,7 +147,7 @@ class ArmMotion:
             if any(servo.dq_set) and servo.status is not RobotStatus.LOST:
                 return None
             outcome = MotionOutcome.STOPPED
-        elif not mine and self._robot._mail.state.seq() > self._opened:  # a state that is newer than the session
+        elif not mine and self._robot._mail.state.seq() > self._session._opened:
             outcome = MotionOutcome.CANCELLED if self._cancelled else MotionOutcome.STOPPED
         else:
             return None

@@ -165,6 +165,11 @@ class Servo:
         return self._session is not None
 
     @property
+    def watchdog(self) -> Watchdog:
+        """The permission of the session to move."""
+        return self._watchdog
+
+    @property
     def smoother(self) -> JointSmoother:
         """The set-point."""
         return self._smoother
@@ -368,12 +373,12 @@ class Servo:
         before, self._t_tick = self._t_tick, now
         return self.spec.attended and before is not None and not now - before <= SILENCE
 
-    def device_lost(self, now: float) -> Setpoint | None:
+    def device_lost(self, now: float, inbox: Inbox) -> Setpoint | None:
         """Trip and continue braking, because the device did not answer; return the next set-point or None."""
         self._t_tick = now
         self._envelope.limited = Limited.NONE
         self._ahead = None
-        self._watchdog.device_lost(now)
+        self._watchdog.update(now, inbox, False, Trip.DEVICE_LOST)
         self._anchoring.note_silence()
         self._compliance.active = False
         if self._torque.active:

@@ -33,7 +33,8 @@ class Watchdog:
     press. A dead-man that is already held when the session opens does not count (it may be taped down, or held from
     before), except for ``move_to``, whose goal is known. Without a dead-man, motion is allowed from the start and a
     trip is cleared by ``control.rearm()``. The cause of the trip must be gone first: a press or a rearm that came while
-    it lasted does not count.
+    it lasted does not count. A stop by ``rig.stop()`` replaces every trip but a fault, is shown once the fault is
+    cleared, and is itself cleared only by a later press or by a rearm that acknowledges it.
     """
 
     def __init__(self, dt: float = 0.0) -> None:
@@ -49,11 +50,13 @@ class Watchdog:
         """Whether the arm may move in this tick."""
         self.renewed = False
         """Whether the permission was granted in this tick. Commands that were sent before do not count any more."""
-        self._stops: int | None = None
+        self.stops = 0
+        """Number of calls of ``rig.stop()`` that were seen."""
+        self._stopped = False
+        """Whether one of them is not acknowledged."""
         self._presses = 0
-        self._rearms = 0
-        self._rebase = False
-        """Whether presses and rearms of the ticks without a reading are still to be discarded."""
+        self.rearms = 0
+        """Number of the rearms that were handled; one waits until the arm is at rest."""
         self._command: CommandRecord | None = None
         """The command that the arm follows."""
 
@@ -61,10 +64,10 @@ class Watchdog:
         """Open a session. Presses and rearms count from those in ``inbox``, stops from those that the app knew of."""
         self.session = session
         self.trip = Trip.NONE
-        self.allowed = self.renewed = self._rebase = False
+        self.allowed = self.renewed = self._stopped = False
         self._command = None
-        self._rearms = inbox.rearms
-        self._stops = session.stops
+        self.rearms = inbox.rearms
+        self.stops = inbox.acknowledged
         deadman = inbox.deadman
         # For move_to, a dead-man that is held already is as good as pressed now.
         known = session.is_motion and deadman is not None and deadman.held
@@ -80,13 +83,6 @@ class Watchdog:
         """Expect the next command before the deadline of this one; None if none is due."""
         self._command = command
 
-    def device_lost(self, now: float) -> None:
-        """Latch ``Trip.DEVICE_LOST``: the device did not answer in this cycle."""
-        if self.session is not None:
-            self._latch(Trip.DEVICE_LOST, now)
-            self._rebase = True
-            self.renewed = False
-
     def update(self, now: float, inbox: Inbox, at_rest: bool, device: Trip = Trip.NONE, late: bool = False) -> bool:
         """Decide for one tick.
 
@@ -100,12 +96,12 @@ class Watchdog:
         Returns:
             :attr:`allowed`.
         """
-        stopped = self._stops is not None and inbox.stops != self._stops
-        self._stops = inbox.stops
         self.renewed = False
         session = self.session
         if session is None:
             return False
+        stopped = inbox.stops != self.stops
+        self.stops, self._stopped = inbox.stops, self._stopped or stopped
         deadman = inbox.deadman
         cause = self._cause(now, session, inbox, stopped, device, late)
         if cause and cause in _HARMLESS_AT_REST and session.deadman and not self.allowed and not self.trip:
@@ -114,6 +110,8 @@ class Watchdog:
             return False
         if cause:
             self._latch(cause, now)
+        if self._stopped and cause is not Trip.FAULT:
+            self.trip = Trip.STOP  # also after a fault that hid it
         if self.trip:
             self._try_to_clear(session, inbox, at_rest, cause)
         elif session.deadman:
@@ -164,18 +162,18 @@ class Watchdog:
         self.allowed = False
         deadman = inbox.deadman
         presses = self._presses if deadman is None else deadman.presses
-        if cause is not Trip.NONE or self._rebase:
-            self._presses, self._rearms = presses, inbox.rearms
-            self._rebase = False
+        if cause is not Trip.NONE:
+            self._presses, self.rearms = presses, inbox.rearms
             return
         if not at_rest:
             return
         if session.deadman:
             if deadman is not None and deadman.held and presses != self._presses:
                 self._grant(presses)
-        elif inbox.rearms != self._rearms:
-            self._rearms = inbox.rearms
-            self._grant(presses)
+        elif inbox.rearms != self.rearms:
+            self.rearms = inbox.rearms
+            if not self._stopped or inbox.acknowledged == inbox.stops:
+                self._grant(presses)
 
     def _follow_deadman(self, deadman: DeadmanRecord, at_rest: bool) -> None:
         if self.allowed and not (deadman.held and deadman.presses == self._presses):
@@ -187,6 +185,7 @@ class Watchdog:
 
     def _grant(self, presses: int) -> None:
         self.trip = Trip.NONE
+        self._stopped = False
         self._presses = presses
         self._command = None
         self.allowed = self.renewed = True

@@ -10,7 +10,6 @@ from unittest.mock import patch
 
 from .. import registry
 from ..clock import LockStepClock
-from ..deadman import StopLatch
 from ..gripper import Gripper
 from ..host.cycle import ArmUnit
 from ..host.gripper_unit import GripperUnit
@@ -28,22 +27,15 @@ class _BenchHost(Host):
     """A host whose cycles the checks run themselves."""
 
     def __init__(self, spec: GroupSpec) -> None:
+        super().__init__()
         self.spec = spec
         self.memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
-        self.stopped = 0
-
-    @property
-    def stops(self) -> int:
-        return self.stopped
 
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
         raise NotImplementedError(f"a bench has no request {method}")
 
     def check(self) -> None:
         """Do nothing: it never ends."""
-
-    def stop(self) -> None:
-        self.stopped += 1
 
     def close(self) -> None:
         """Do nothing: the checks close what they opened."""
@@ -63,7 +55,7 @@ class HostedRobot:
         host = _BenchHost(GroupSpec("bench", clock, 1.0 / bench.dt, (spec,)))
         with patch.object(registry, "load", lambda name, kind: lambda spec, world: bench.driver):
             self.unit = ArmUnit(spec, bench.dt, host.memory.robots[spec.name], None)
-        self.robot = Robot(spec, host, LockStepClock(lambda: bench.now, self._advance_to), StopLatch())
+        self.robot = Robot(spec, host, LockStepClock(lambda: bench.now, self._advance_to))
 
     def run_cycles(self, cycles: int) -> RobotState:
         """Run cycles of the host, and return the state that the app sees; raises what the app's ``state()`` raises."""
@@ -105,9 +97,7 @@ class HostedGripper:
         self.bench = bench
         self.host = _BenchHost(GroupSpec("bench", clock, 1.0 / bench.dt, (), grippers=(spec,)))
         self.unit = GripperUnit(bench.driver, self.host.memory.grippers[spec.name])
-        self.gripper = Gripper(
-            spec, "bench", self.host, LockStepClock(lambda: bench.now, self._advance_to), StopLatch()
-        )
+        self.gripper = Gripper(spec, "bench", self.host, LockStepClock(lambda: bench.now, self._advance_to))
 
     def run_for(self, seconds: float) -> GripperState:
         """Run the host for ``seconds``, and return the state that the app sees; raises what its ``state()`` raises."""
@@ -117,7 +107,7 @@ class HostedGripper:
 
     def _run_cycle(self) -> None:
         now = self.bench.pass_time()
-        self.unit.serve(AppRecord(now, self.host.stops))
+        self.unit.serve(now, AppRecord(now, self.host.latch.stops))
         self.unit.publish(now)
 
     def _advance_to(self, t: float) -> None:

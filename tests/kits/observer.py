@@ -22,6 +22,7 @@ from typing import Any
 
 from hal.host.process import SharedMemory
 from hal.host.records import GroupMemory, ServoRecord
+from hal.types import GripperOutcome
 
 APP = """
 import json, os, sys, time
@@ -34,7 +35,7 @@ children = [host.child.process.pid] + ([rig._pictures._child.process.pid] if rig
 velocity = [0.4, 0.0, 0.0, 0.0, 0.4, 0.0, 0.4]
 with rig, arm.control(rate_hz={rate_hz}) as control:
     for turn, tick in enumerate(rig.clock.rate(50)):
-        control.send(hal.JointVelocity(velocity))
+        control.send(hal.JointVelocity(velocity), grip=1.0)
         if turn == 20:
             names = [[r.name, len(r.joints)] for r in host.spec.robots]
             told = {{"pid": os.getpid(), "children": children, "fd": host.shared.fd, "joints": names}}
@@ -49,6 +50,9 @@ with rig, arm.control(rate_hz={rate_hz}) as control:
                 pass
 """
 
+
+SLOW_FINGERS = "robots.panda.gripper.speed=0.02"
+"""They close for 4 s."""
 
 SHELL = """
 import os, signal, subprocess, sys
@@ -73,7 +77,9 @@ class Watched:
         rate_hz: float = 50.0,
     ) -> None:
         """Start it; it sends 50 commands a second, and has to send ``rate_hz``."""
-        program = APP.format(config=config, overrides=overrides or ["cameras={}"], ending=ending, rate_hz=rate_hz)
+        program = APP.format(
+            config=config, overrides=overrides or ["cameras={}", SLOW_FINGERS], ending=ending, rate_hz=rate_hz
+        )
         script = folder / "app.py"
         script.write_text(program)
         self.terminal, slave = pty.openpty()
@@ -135,6 +141,11 @@ class Watched:
     def at_rest(self) -> bool:
         """Whether the set-point stands still."""
         return self.speed() < 1e-9
+
+    def fingers_stopped(self) -> bool:
+        """Whether the fingers were stopped on their way."""
+        found = self.memory.grippers["panda.gripper"].get()
+        return found is not None and found.state.outcome is GripperOutcome.STOPPED
 
     def nobody_left(self) -> bool:
         """Whether all processes of the rig have ended."""

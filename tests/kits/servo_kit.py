@@ -58,8 +58,12 @@ class HandTicked:
         self.command: CommandRecord | None = None
         self.deadman = DeadmanRecord(False, True, 0, 0.0) if deadman else None
         self.pad_alive = self.app_alive = True
-        self.stops = self.rearms = 0
+        self.stops = self.rearms = self.acknowledged = 0
         self.limited = Limited.NONE
+
+    def rearm(self) -> None:
+        """Acknowledge the trip, and every stop so far."""
+        self.rearms, self.acknowledged = self.rearms + 1, self.stops
 
     def press(self) -> None:
         self.deadman = self.deadman._replace(held=True, presses=self.deadman.presses + 1)
@@ -83,7 +87,7 @@ class HandTicked:
             self.t_app = self.now
         if self.deadman is not None and self.pad_alive:
             self.deadman = self.deadman._replace(t_alive=self.now)
-        return Inbox(self.command, self.deadman, self.stops, self.rearms, self.t_app)
+        return Inbox(self.command, self.deadman, self.stops, self.rearms, self.t_app, self.acknowledged)
 
     def tick(self) -> Setpoint | None:
         raise NotImplementedError
@@ -132,7 +136,7 @@ class Bench(HandTicked):
 
     def begin(self, known_stops: int | None = None) -> None:
         """Open the session; the app knew of so many stops then (all of them)."""
-        self.session = self.session._replace(stops=self.stops if known_stops is None else known_stops)
+        self.acknowledged = self.stops if known_stops is None else known_stops
         self.servo.open_session(self.session, self.inbox())
 
     @property
@@ -164,7 +168,7 @@ class Bench(HandTicked):
     def lose(self) -> Setpoint | None:
         """A cycle in which the device did not answer."""
         self.now += self.dt
-        return self._take(self.servo.device_lost(self.now))
+        return self._take(self.servo.device_lost(self.now, self.inbox()))
 
     def _take(self, setpoint: Setpoint | None) -> Setpoint | None:
         self.limited |= self.servo.report.limited

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from hal.clock import LockStepClock
 from hal.commands import Command
 from hal.config.loader import load
-from hal.deadman import StopLatch
 from hal.drivers.can import damiao_chain, piper_link
 from hal.drivers.can.emulator import console, server
 from hal.errors import ConnectionLost, HalError, MotionStopped, RobotFault
+from hal.gripper import Gripper
 from hal.host import cycle as host_cycle
 from hal.host.hosts import LocalHost
 from hal.robot import Robot
@@ -96,20 +96,26 @@ class SteppedArm:
         control: A session, which is not open.
     """
 
-    def __init__(self, far: SteppedEmulator) -> None:
+    def __init__(self, far: SteppedEmulator, grips: bool = False) -> None:
+        """Open it, with its gripper if ``grips``."""
         self.far = far
-        spec = replace(far.spec, gripper=None, workspace=None)  # an arm that sank may be below the table
-        self.host = LocalHost(GroupSpec("arm", "lock_step", spec.rate_hz, (spec,)))
+        gripper = far.spec.gripper if grips else None
+        spec = replace(far.spec, gripper=gripper, workspace=None)  # an arm that sank may be below the table
+        grippers = () if gripper is None else (gripper,)
+        self.host = LocalHost(GroupSpec("arm", "lock_step", spec.rate_hz, (spec,), None, grippers))
         cycle = self.host.cycle
         step = cycle.step
 
         def step_both(*arguments: Any) -> None:
             far.advance(cycle.dt)
             step(*arguments)
+            for unit in cycle.grippers.values():
+                unit.publish(cycle.t)  # a CAN gripper is driven when it is read, in real time in every cycle
 
         cycle.step = step_both  # type: ignore[method-assign]
         self.clock = LockStepClock(self.host.now, self.host.advance_to)
-        self.robot = Robot(spec, self.host, self.clock, StopLatch())
+        hand = None if gripper is None else Gripper(gripper, spec.name, self.host, self.clock)
+        self.robot = Robot(spec, self.host, self.clock, hand)
         self.driver: Any = cycle.arms[spec.name].driver
         self.control = self.robot.control(rate_hz=50, unattended=True)
 

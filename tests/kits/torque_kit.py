@@ -98,7 +98,7 @@ class Driven(HandTicked):
         self.reading = self.driver.read(self.now)
         self.readings.append(self.reading)
         if self.silent:
-            self.setpoint = self.servo.device_lost(self.now)
+            self.setpoint = self.servo.device_lost(self.now, self.inbox())
         else:
             self.setpoint = self.servo.tick(self.now, self.tamper(self.reading), self.inbox())
         self.limited |= self.servo.report.limited

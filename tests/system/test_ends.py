@@ -1,5 +1,6 @@
 """However an app ends, its arm is brought to rest by the arm's own process, and nothing is left behind."""
 
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +39,7 @@ def test_an_app_that_ends(watch, how: str, command: str) -> None:
     assert app.speed() > 0.1, "the arm moves before"
     app.end(how)
     app.wait_for(app.at_rest)
+    app.wait_for(app.fingers_stopped)
     app.wait_for(app.nobody_left)
 
 
@@ -47,10 +49,46 @@ def test_an_app_that_is_stopped_but_still_there(watch, how: str, command: str) -
     assert app.speed() > 0.1
     app.end(how)
     app.wait_for(app.at_rest)
+    app.wait_for(app.fingers_stopped)
     servo = app.servo()
     assert servo.status is RobotStatus.TRIPPED
     assert servo.trip in (Trip.APP_SILENT, Trip.COMMAND_LATE)
     assert not app.nobody_left(), "the host keeps holding: the app may come back"
+
+
+FORK = """
+import os, sys
+import hal
+
+turn = hal.JointVelocity([0.1] + [0.0] * 6)
+with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=["cameras={}"]) as rig:
+    with rig.robots["panda"].control(rate_hz=5) as control:
+        control.send(turn)
+        if not (child := os.fork()):
+            for use in (lambda: control.send(turn), control.rearm, rig.stop, rig.robots["panda"].state):
+                try:
+                    use()
+                    os._exit(1)
+                except hal.HalError as error:
+                    assert error.code == "forked", error
+            sys.exit(7)
+        ended, status, turns = 0, 0, 0
+        for tick in rig.clock.rate(50):
+            control.send(turn)
+            if not ended:
+                ended, status = os.waitpid(child, os.WNOHANG)
+            turns += ended > 0
+            if turns > 20 or tick.elapsed > 20.0:
+                break
+        assert os.waitstatus_to_exitcode(status) == 7, tick
+        assert control.status is hal.RobotStatus.FOLLOWING
+print("done")
+"""
+
+
+def test_a_fork_of_the_program_ends_nothing() -> None:
+    run = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, timeout=60)
+    assert run.stdout == "done\n", run.stderr
 
 
 @pytest.mark.parametrize(
@@ -72,7 +110,7 @@ def test_an_app_that_is_killed_while_a_motion_runs(watch, monkeypatch: pytest.Mo
     session = "with rig, arm.control(rate_hz={rate_hz}) as control:"
     assert session in observer.APP
     motion = "motion = arm.start_move_to([2.0, *arm.home[1:]], speed=0.2)\nwith rig:"
-    send = f"control.send({MOTION})"
+    send = f"control.send({MOTION}, grip=1.0)"
     monkeypatch.setattr(observer, "APP", observer.APP.replace(session, motion).replace(send, "motion.progress"))
     app = watch()
     assert app.speed() > 0.1, "the arm moves before"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -47,9 +47,9 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
 
 
-def open_rig(driver: str) -> hal.Rig:
-    overrides = ["cameras={}", f"robots.panda.gripper.drivers={{sim: 'lab_hand:{driver}'}}"]
-    return hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=overrides)
+def open_rig(driver: str, clock: str = "real_time", *more: str) -> hal.Rig:
+    overrides = ["cameras={}", f"robots.panda.gripper.drivers={{sim: 'lab_hand:{driver}'}}", *more]
+    return hal.open("panda_table", sim=True, clock=clock, pad="none", overrides=overrides)
 
 
 @pytest.fixture
@@ -101,6 +101,29 @@ def test_a_stop_of_the_rig_reaches_it(rig: hal.Rig) -> None:
         hand.start(0.0)
     rig.rearm()
     assert hand.home().width == pytest.approx(hand.width_max, abs=1e-3)
+
+
+@pytest.mark.parametrize("clock", ["real_time", "lock_step"])
+def test_it_stops_with_the_session_of_its_arm(lab: None, clock: str) -> None:
+    with open_rig("HAND", clock, "robots.panda.gripper.speed=0.02") as rig:
+        arm, hand, deadman = rig.robots["panda"], hand_of(rig), hal.Deadman("the test's")
+
+        def drive(control: hal.Control, held: bool, until: Callable[[], bool]) -> None:
+            for tick in rig.clock.rate(50):
+                deadman.update(held, True, rig.clock.now())
+                control.send(JointVelocity([0.01, 0, 0, 0, 0, 0, 0]), grip=1.0)
+                if until():
+                    return
+                assert tick.elapsed < 10.0
+
+        deadman.update(False, True, rig.clock.now())
+        with arm.control(deadman=deadman, rate_hz=5) as control:
+            drive(control, True, lambda: hand.state().width < 0.075)
+            drive(control, False, lambda: hand.state().outcome is GripperOutcome.STOPPED)
+            stopped = hand.state().width
+            assert stopped > 0.02
+            drive(control, True, lambda: hand.state().width < stopped - 0.005)
+        wait_until(lambda: hand.state().outcome is GripperOutcome.STOPPED or rig.clock.sleep(0.01))
 
 
 def test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead(rig: hal.Rig) -> None:

@@ -10,7 +10,7 @@ from drives import ArmWithDrives
 from specs import panda
 
 from hal import registry
-from hal.commands import CommandRecord, Kind, Session
+from hal.commands import CommandRecord, Kind, Session, SessionRecord
 from hal.errors import ConnectionLost, RobotFault
 from hal.geometry import Pose
 from hal.host.cycle import LOWER_LIMIT, TCP_APART, TCP_TURNED, ArmUnit, Cycle
@@ -74,6 +74,7 @@ def driving() -> tuple[ArmUnit, float]:
     """An arm that follows velocities, and the time."""
     arm = unit()
     arm.open(1.0)
+    arm.mail.put_session(SessionRecord(1, 0, 0))
     arm.open_session(Session(1, 1.0, 100.0, False), AppRecord(1.0, 0), never)
     for k in range(1, 20):
         cycle(arm, 1.0 + k * DT)
@@ -142,6 +143,7 @@ class TwoArms:
         self.cycle.step(now, AppRecord(now, 0))
 
     def begin(self, name: str) -> None:
+        self.cycle.arms[name].mail.put_session(SessionRecord(1, 0, 0))
         self.cycle.request("begin", {"robot": name, "session": list(Session(1, 1.0, 100.0, False))})
 
     def drive(self, arm: ArmUnit) -> None:
@@ -204,7 +206,7 @@ def test_drives_that_went_off_are_switched_on_again_when_the_arm_has_to_move(mon
         arms.turn()
     assert arms.right.servo.report.trip is Trip.FAULT  # not before a user agrees
     assert (driver.engaged, len(driver.log)) == (False, written)
-    arms.right.mail.rearm()
+    arms.right.mail.put_session(SessionRecord(1, 0, 1))
     arms.drive(arms.right)
     assert driver.engaged
 
@@ -218,7 +220,7 @@ def test_drives_that_went_off_without_a_fault_come_on_only_after_a_rearm(monkeyp
     for _ in range(60):
         arms.turn()
     assert (arms.right.servo.report.trip, driver.engaged) == (Trip.DEVICE_LOST, False)
-    arms.right.mail.rearm()
+    arms.right.mail.put_session(SessionRecord(1, 0, 1))
     arms.drive(arms.right)
     assert driver.engaged
 

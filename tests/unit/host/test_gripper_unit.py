@@ -58,13 +58,15 @@ class Bench:
     def __init__(self, spec: GripperSpec) -> None:
         memory = memoryview(bytearray(GripperMail.size()))
         self.driver = Scripted(spec)
-        self.unit = GripperUnit(self.driver, GripperMail(memory))
+        self.unit = GripperUnit(self.driver, GripperMail(memory), lambda now: self.allowed)
         self.mail = GripperMail(memory)
-        self.seq = self.stops = 0
+        self.seq = self.stops = self.session = self.allowed = 0
+        self.silence = 0.0
+        """Age of the app's sign of life, s."""
 
     def tell(self, act: GripperAct, *numbers: float) -> None:
         self.seq += 1
-        self.mail.put_command(GripperCommand(self.seq, self.stops, act, *numbers))
+        self.mail.put_command(GripperCommand(self.seq, self.stops, self.session, act, *numbers))
 
     def report(self, **changes: Any) -> GripperRecord:
         """One cycle, in which the device has a new sample."""
@@ -73,7 +75,8 @@ class Bench:
         return self.turn()
 
     def turn(self) -> GripperRecord:
-        self.unit.serve(AppRecord(0.0, self.stops))
+        now = self.driver.reading.t
+        self.unit.serve(now, AppRecord(now - self.silence, self.stops))
         self.unit.publish(self.driver.reading.t)
         found = self.mail.get()
         assert found is not None
@@ -222,6 +225,47 @@ def test_a_command_that_was_sent_before_a_stop_moves_nothing_after_it(bench: Ben
     assert bench.outcome() is GripperOutcome.STOPPED
     bench.report()
     assert bench.driver.calls == [("stop",)]
+
+
+@pytest.mark.parametrize("session", [0, 7])
+def test_a_motion_ends_with_the_app(bench: Bench, session: int) -> None:
+    bench.session = bench.allowed = session
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    bench.silence = 0.14
+    assert bench.outcome(moving=True) is GripperOutcome.RUNNING
+    bench.silence = 0.16
+    assert bench.outcome(moving=True) is GripperOutcome.STOPPED
+    bench.tell(GripperAct.MOVE, 0.03, 0.05, 10.0)
+    bench.report()
+    assert [call[0] for call in bench.driver.calls] == ["move", "stop"]
+
+
+def test_a_motion_ends_when_its_session_may_not_move_any_more(bench: Bench) -> None:
+    bench.session = bench.allowed = 7
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    assert bench.outcome(moving=True) is GripperOutcome.RUNNING
+    bench.allowed = 0
+    assert bench.outcome(moving=True) is GripperOutcome.STOPPED
+    bench.report()
+    assert [call[0] for call in bench.driver.calls] == ["move", "stop"]
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    bench.allowed = 7
+    assert bench.outcome(moving=False, width=0.02) is GripperOutcome.DONE
+    bench.allowed = 0
+    assert bench.outcome() is GripperOutcome.DONE, "what it holds stays held"
+    assert [call[0] for call in bench.driver.calls] == ["move", "stop", "move"]
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.2])
+def test_a_command_waits_a_moment_for_its_session(bench: Bench, seconds: float) -> None:
+    bench.session = 7
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    for _ in range(round(seconds / 0.01)):
+        bench.report()
+    bench.allowed = 7
+    outcome = bench.outcome(moving=True)
+    assert outcome is (GripperOutcome.RUNNING if seconds < 0.15 else GripperOutcome.STOPPED)
+    assert len(bench.driver.calls) == (outcome is GripperOutcome.RUNNING)
 
 
 def test_a_stop_that_fails_is_told(bench: Bench) -> None:

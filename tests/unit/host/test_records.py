@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from hal.commands import CommandRecord, DeadmanRecord, Kind
+from hal.commands import CommandRecord, DeadmanRecord, Kind, SessionRecord
 from hal.driver import GripperReading, Reading
 from hal.errors import Fault
 from hal.host.records import GripperAct, GripperCommand, GripperMail, GroupMemory, RobotMail, ServoRecord
@@ -76,9 +76,9 @@ def test_a_record_is_decoded_once_and_kept_when_the_next_one_comes(mails: tuple[
     assert (first.stamp.seq, first.q.tolist()) == (9, Q), "arrays of an old state do not change"
 
 
-def test_a_command_a_deadman_and_marks_arrive(mails: tuple[RobotMail, RobotMail]) -> None:
+def test_a_command_a_deadman_and_a_session_arrive(mails: tuple[RobotMail, RobotMail]) -> None:
     app, host = mails
-    assert (host.get_command(), host.get_deadman(), host.get_marks()) == (None, None, (0, 0))
+    assert (host.get_command(), host.get_deadman(), host.get_session()) == (None, None, (0, 0, 0))
     twist = CommandRecord(3, 1, 2.0, 2.1, Kind.TWIST, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1.0), 1.9)
     target = CommandRecord(4, 1, 2.0, 2.1, Kind.JOINT_TARGET, (*Q, *DQ))
     for command in (twist, target):
@@ -87,18 +87,16 @@ def test_a_command_a_deadman_and_marks_arrive(mails: tuple[RobotMail, RobotMail]
         assert host.get_command() is host.get_command()
     deadman = DeadmanRecord(True, True, 5, 1.75)
     app.put_deadman(deadman)
-    app.rearm()
-    app.rearm()
-    app.close_session(6)
+    app.put_session(SessionRecord(6, 4, 2))
     assert host.get_deadman() == deadman
-    assert host.get_marks() == (2, 6)
+    assert host.get_session() == (6, 4, 2)
 
 
 def test_a_grippers_command_and_state_arrive() -> None:
     memory = memoryview(bytearray(GripperMail.size()))
     app, host = GripperMail(memory), GripperMail(memory)
     assert (host.get_command(), app.get()) == (None, None)
-    command = GripperCommand(7, 2, GripperAct.GRASP, 0.03, 0.1, 40.0, 0.004, 0.006)
+    command = GripperCommand(7, 2, 3, GripperAct.GRASP, 0.03, 0.1, 40.0, 0.004, 0.006)
     app.put_command(command)
     assert host.get_command() == command
     fault = Fault("hot", "it is too hot \u2717", "let it cool down")
@@ -126,15 +124,15 @@ def test_mailboxes_of_a_group_do_not_overlap() -> None:
     memory = memoryview(bytearray(GroupMemory.size(robots, grippers)))
     app, host = (GroupMemory(memory, robots, grippers) for _ in range(2))
     for k, name in enumerate(grippers):
-        app.grippers[name].put_command(GripperCommand(k + 1, 0, GripperAct.HOME))
+        app.grippers[name].put_command(GripperCommand(k + 1, 0, 0, GripperAct.HOME))
         host.grippers[name].put(GripperReading(k, k, k, 0.01 * k, 0.0, False))
-    app.robots["right"].rearm()
+    app.robots["right"].put_session(SessionRecord(1, 0, 1))
     app.app.write(1.0, 5)
     host.host.write(2.0, 3, 4, True)
     for k, name in enumerate(grippers):
         command, found = host.grippers[name].get_command(), app.grippers[name].get()
         assert (command.seq, found.state.width) == (k + 1, 0.01 * k)
-    assert (host.robots["left"].get_marks().rearms, host.robots["right"].get_marks().rearms) == (0, 1)
+    assert (host.robots["left"].get_session().rearms, host.robots["right"].get_session().rearms) == (0, 1)
     assert (host.get_app(), app.get_host()) == ((1.0, 5), (2.0, 3, 4, True))
 
 

@@ -115,7 +115,7 @@ def test_a_trip_latches_and_a_rearm_goes_on() -> None:
     bench.stops += 1
     bench.until_rest(0.5)
     assert bench.trip is Trip.STOP
-    bench.rearms += 1
+    bench.rearm()
     finish(bench)
     assert bench.q == pytest.approx(GOAL, abs=1e-12)
     bench.assert_within_limits()
@@ -317,7 +317,7 @@ def test_wild_chunks_never_break_a_limit(seed: int) -> None:
             times = [bench.now - 0.01, *sorted(t + 0.4 for t in times[1:])]
         send(bench, times, points)
         bench.run(rng.uniform(0.05, 0.6))
-        bench.rearms += 1
+        bench.rearm()
     bench.until_rest(10.0)
     assert max(abs(q[0] - PANDA_HOME[0]) for q in bench.history) > 0.01
     bench.assert_within_limits()

@@ -101,7 +101,7 @@ def test_a_stop_is_made_on_the_line_and_the_motion_continues_on_it(cause: str) -
             if cause == "deadman":
                 bench.press()
             else:
-                bench.rearms += 1
+                bench.rearm()
         finish(bench)
         away, turned = off_line(bench)
         assert away < 2e-4

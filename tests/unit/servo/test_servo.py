@@ -85,7 +85,7 @@ def test_the_first_target_must_be_near() -> None:
     assert bench.q == pytest.approx(near)
     bench.stops += 1
     bench.run(0.1)
-    bench.rearms += 1
+    bench.rearm()
     bench.run(0.1)
     refused = bench.target([x - 0.2 * (k == 3) for k, x in enumerate(PANDA_HOME)])
     bench.run(0.3)
@@ -133,7 +133,7 @@ def test_hostile_numbers_never_leave_the_limits() -> None:
             )
             bench.tick()
             if bench.trip:
-                bench.rearms += 1
+                bench.rearm()
         assert bench.servo.report.target_seq > 5
         bench.assert_within_limits()
 

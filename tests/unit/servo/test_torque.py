@@ -206,7 +206,7 @@ class TestStopping:
         arm.until_held()
         arm.drive(0.2, one(0, 3.0))
         assert arm.state == (RobotStatus.TRIPPED, Trip.STOP)
-        arm.rearms += 1
+        arm.rearm()
         arm.drive(0.2, one(0, 3.0))
         assert arm.state == (RobotStatus.FOLLOWING, Trip.NONE)
 

@@ -39,7 +39,7 @@ def assert_only_a_new_press_continues(bench: Bench, trip: Trip) -> None:
     """Check that neither new commands, a rearm nor the release of the dead-man clear the stop."""
     bench.until_rest(0.5)
     bench.drive(0.3)
-    bench.rearms += 1
+    bench.rearm()
     bench.drive(0.3)
     bench.release()
     bench.run(0.1)
@@ -215,7 +215,7 @@ def test_without_a_deadman_a_rearm_goes_on() -> None:
     assert bench.trip is Trip.STOP
     bench.drive(0.3)
     assert not bench.moving
-    bench.rearms += 1
+    bench.rearm()
     bench.run(0.2)
     assert bench.trip is Trip.NONE
     assert not bench.moving

@@ -393,6 +393,25 @@ def test_the_first_command_to_a_pipers_gripper_starts_where_its_fingers_are(
     assert max(a - b for a, b in itertools.pairwise(widths)) <= 0.05 / piper.spec.rate_hz + 1e-6
 
 
+@pytest.mark.parametrize("block", [None, 0.05])
+def test_a_stop_of_a_pipers_fingers_that_lag_behind_their_target(
+    piper: Bench, monkeypatch: pytest.MonkeyPatch, block: float | None
+) -> None:
+    """Fingers slower than the command stop where they are; those that an object blocks press on with the same force."""
+    monkeypatch.setattr("hal.drivers.can.emulator.piper._FINGER_SPEED", 0.02)
+    piper.arm.gripper_width = 0.07
+    piper.arm.restart()
+    if block is not None:
+        piper.emulator.execute(f"object {block}")
+    driver = piper.open(PiperGripper(piper.spec.gripper))
+    driver.move(0.0, 0.1, 10.0)
+    at = piper.cycle(round(1.5 * piper.spec.rate_hz)).width
+    driver.stop()
+    piper.cycle(round(0.5 * piper.spec.rate_hz))
+    assert piper.reading.width == pytest.approx(at if block is None else block, abs=1e-3)
+    assert piper.reading.force == pytest.approx(0.0 if block is None else 10.0, abs=0.2)
+
+
 # The bus.
 
 
