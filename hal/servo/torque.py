@@ -119,8 +119,8 @@ class TorqueMotion(ServoMotion):
         if reading is None:
             self._still = 0.0
             return
+        self._update_inertia()  # where the arm was a tick ago: it is the same
         self.q, self.dq = reading.q, reading.dq
-        self._update_inertia()
         if reading.tau_commanded is not None:
             self.tau = list(reading.tau_commanded)  # what was lost on its way must not make the next step greater
         self._still = self._still + dt if max(map(abs, reading.dq)) < _REST else 0.0
