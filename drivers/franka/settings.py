@@ -33,6 +33,10 @@ __all__ = [
     "is_emulated",
 ]
 
+_NO_ADDRESS = (
+    "is missing: the robot's address, as Desk shows it; pass it with --set KEY=ADDRESS (overrides= of hal.open), "
+    "KEY as above, or write it into a rig file of your own"
+)
 _LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
 
 
@@ -258,7 +262,7 @@ def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterat
     validate(model, options, "", problems, "real")
     for problem in problems.found:
         missing = problem.key == "real.host" and "host" not in options
-        message = "is missing: the robot's address, for example 172.16.0.2" if missing else problem.message
+        message = _NO_ADDRESS if missing else problem.message
         yield problem.key, message, problem.code
 
 

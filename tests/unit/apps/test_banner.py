@@ -5,12 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import yaml
 from engines_kit import AUTO
 from specs import data
 
 import hal
 from hal.apps._display import banner, list_devices
 from hal.config import load
+from hal.config.data_files import find_data, list_data
+from hal.drivers.franka.settings import is_emulated
 
 
 def robot_line(config: Any, **arguments: Any) -> str:
@@ -22,13 +25,27 @@ def robot_line(config: Any, **arguments: Any) -> str:
     ("config", "sim", "words"),
     [
         ("franka", True, f"fr3, simulated ({AUTO}), 240 Hz, gripper 0..0.08 m"),
-        ("franka", False, "fr3, REAL (franka at 172.16.0.2), 1000 Hz, gripper 0..0.08 m"),
         ("franka_emulator", None, "fr3, EMULATED (franka at 127.0.0.2), 1000 Hz, gripper 0..0.08 m"),
         ("franka_emulator", True, f"fr3, simulated ({AUTO}), 240 Hz"),
     ],
 )
 def test_an_arm_is_called_what_it_is(config: str, sim: bool | None, words: str) -> None:
     assert words in robot_line(config, sim=sim)
+
+
+@pytest.mark.parametrize("rig", list_data("config"))
+def test_a_built_in_rig_names_no_robot_that_is_not_the_users(rig: str) -> None:
+    written = yaml.safe_load(find_data("config", f"{rig}.yaml").read_text())
+    for arm in written["robots"].values():
+        assert is_emulated({"host": arm.get("real", {}).get("host", "127.0.0.1")})
+    if rig in ("franka", "panda_table"):
+        with pytest.raises(hal.ConfigError, match="real.host: is missing.* --set"):
+            load(rig, sim=False)
+
+
+def test_a_real_arm_is_called_real() -> None:
+    line = robot_line("franka", sim=False, overrides=["robots.arm.real.host=172.16.0.2"])
+    assert "fr3, REAL (franka at 172.16.0.2), 1000 Hz, gripper 0..0.08 m" in line
 
 
 def test_a_real_hand_on_a_simulated_arm_is_called_real() -> None:

@@ -37,7 +37,7 @@ SKILL = ("--skill", "skills:wait", "--out", "out")
         ([*SKILL, "--sim", "--workers", "0"], "--workers"),
         ([*SKILL, "--sim", "--cameras", "wirst"], "did you mean 'wrist'"),
         ([*SKILL, "--config", "franka_emulator"], "--sim"),
-        ([*SKILL, "--real", "--set", "cameras={}"], "leave out --real"),
+        ([*SKILL, "--real", "--set", "cameras={}", "--set", "robots.panda.real.host=172.16.0.2"], "leave out --real"),
     ],
 )
 def test_a_mistake_is_a_message(folder: Path, arguments: list[str], text: str) -> None:

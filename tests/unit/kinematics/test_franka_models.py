@@ -37,9 +37,12 @@ DH = [
     (0.0, 0.107, 0.0),
 ]
 
+ADDRESS = "robots.arm.real.host=172.16.0.2"
+"""No built-in rig has one."""
+
 
 def fr3(**arguments: bool) -> RobotSpec:
-    return load("franka", **arguments).resolve().robots[0]
+    return load("franka", overrides=[ADDRESS], **arguments).resolve().robots[0]
 
 
 def turn_z(angle: float) -> np.ndarray:
@@ -201,7 +204,7 @@ def test_the_pandas_torques_are_those_of_the_published_identification() -> None:
 
 @pytest.mark.parametrize("model", ["fr3", "panda"])
 def test_driver_and_emulator_have_the_inertia_of_the_urdf(model: str) -> None:
-    spec = load("franka", overrides=[f"robots.arm.model={model}"], sim=False).resolve().robots[0]
+    spec = load("franka", overrides=[f"robots.arm.model={model}", ADDRESS], sim=False).resolve().robots[0]
     dynamics, driver, body = Dynamics.of(spec), FrankaArm(spec), RigidBody(Path(spec.urdf))
     assert np.array(driver.mass_matrix(spec.home)) == pytest.approx(np.array(dynamics.mass_matrix(spec.home)))
     still = [0.0] * 7
@@ -243,14 +246,14 @@ def test_every_speed_holds_everywhere_in_the_range() -> None:
 def test_where_the_arm_is_real_one_lost_setpoint_keeps_the_jerk_below_the_arms_own(model: str) -> None:
     overrides = [f"robots.arm.model={model}"]
     simulated = load("franka", overrides=overrides).resolve().robots[0].limits
-    real = load("franka", overrides=overrides, sim=False).resolve().robots[0].limits
+    real = load("franka", overrides=[*overrides, ADDRESS], sim=False).resolve().robots[0].limits
     assert set(real.acceleration) == {4.0}
     assert all(4.0 * ours <= official for ours, official in zip(real.jerk, simulated.jerk, strict=True))
     assert max(real.jerk) <= 1250.0
 
 
 def test_a_panda_that_extrapolates_for_19_cycles_stays_below_its_own_speed_limit() -> None:
-    real = load("franka", overrides=["robots.arm.model=panda"], sim=False).resolve().robots[0].limits
+    real = load("franka", overrides=["robots.arm.model=panda", ADDRESS], sim=False).resolve().robots[0].limits
     for speed, acceleration, official in zip(real.velocity, real.acceleration, LIMITS["fer"].velocity, strict=True):
         assert speed + 0.019 * acceleration <= official
 

@@ -21,7 +21,11 @@ from hal.specs import GripperSpec, LimitsSpec, RobotSpec
 
 def arm(model: str = "fr3", **options: Any) -> RobotSpec:
     """A valid real arm with these options."""
-    spec = load("franka", sim=False, overrides=[f"robots.arm.model={model}"]).resolve().robots[0]
+    spec = (
+        load("franka", sim=False, overrides=[f"robots.arm.model={model}", "robots.arm.real.host=172.16.0.2"])
+        .resolve()
+        .robots[0]
+    )
     return replace(spec, options={**spec.options, **options})
 
 
@@ -222,7 +226,8 @@ def test_other_arms_and_rates_are_refused() -> None:
 
 def test_nothing_of_the_vendor_is_imported_to_check_a_rig() -> None:
     code = (
-        "import sys; from hal.config import load; load('franka', sim=False).resolve();"
+        "import sys; from hal.config import load;"
+        "load('franka', sim=False, overrides=['robots.arm.real.host=172.16.0.2']).resolve();"
         "print([m for m in ('pylibfranka', 'panda_py', 'pinocchio', 'pybullet') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
