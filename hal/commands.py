@@ -7,6 +7,7 @@ servo, and the checks that every command passes before it is sent (:class:`Comma
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -17,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import registry
 from .arguments import frozen, vector
-from .errors import CommandError, NotSupported, Unreachable
+from .errors import CommandError, MotionStopped, NotSupported, Unreachable
 from .geometry import Pose, tcp_pose
+from .types import Trip
 
 if TYPE_CHECKING:
     from .specs import LimitsSpec, RobotSpec
@@ -41,6 +43,7 @@ __all__ = [
     "Sent",
     "Session",
     "SessionRecord",
+    "StopLatch",
     "Twist",
     "encode",
 ]
@@ -280,6 +283,38 @@ class SessionRecord(NamedTuple):
     """Number of calls of ``rig.stop()`` that its opening, or its last rearm, acknowledged."""
     rearms: int
     """Number of calls of ``control.rearm()``."""
+
+
+class StopLatch:
+    """Counts the calls of ``rig.stop()``, and holds them until they are acknowledged. Any thread may call it."""
+
+    def __init__(self) -> None:
+        self.stops = 0
+        """Number of calls of :meth:`stop`."""
+        self._acknowledged = 0
+        self._lock = threading.RLock()  # a signal handler may call stop() in the middle of stop()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the newest stop is not acknowledged."""
+        return self._acknowledged < self.stops
+
+    def stop(self) -> None:
+        """Latch a stop."""
+        with self._lock:
+            self.stops += 1
+
+    def acknowledge(self, stops: int) -> None:
+        """Acknowledge the first ``stops`` of all stops; a later one stays latched."""
+        with self._lock:
+            self._acknowledged = max(self._acknowledged, stops)
+
+    def check(self) -> None:
+        """Raise MotionStopped while the stop is not acknowledged."""
+        if self.stopped:
+            raise MotionStopped(
+                "rig.stop() was called", "call rig.rearm() when it is safe to move again", code=Trip.STOP.code
+            )
 
 
 class CommandRecord(NamedTuple):

@@ -1,4 +1,4 @@
-"""The dead-man switch, a control that must be held for the arm to move, and the latch of ``rig.stop()``."""
+"""The dead-man switch: a control that must be held for the arm to move."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import threading
 from collections.abc import Callable
 
 from .commands import DeadmanRecord
-from .errors import MotionStopped, NotSupported
-from .types import Trip
+from .errors import NotSupported
 
-__all__ = ["Deadman", "StopLatch", "Threshold"]
+__all__ = ["Deadman", "Threshold"]
 
 Sink = Callable[[DeadmanRecord], None]
 
@@ -158,35 +157,3 @@ class Deadman:
 
     def __repr__(self) -> str:
         return f"<Deadman {self.name}: {'held' if self.held else 'released'}>"
-
-
-class StopLatch:
-    """Counts the calls of ``rig.stop()``, and holds them until they are acknowledged. Any thread may call it."""
-
-    def __init__(self) -> None:
-        self.stops = 0
-        """Number of calls of :meth:`stop`."""
-        self._acknowledged = 0
-        self._lock = threading.RLock()  # a signal handler may call stop() in the middle of stop()
-
-    @property
-    def stopped(self) -> bool:
-        """Whether the newest stop is not acknowledged."""
-        return self._acknowledged < self.stops
-
-    def stop(self) -> None:
-        """Latch a stop."""
-        with self._lock:
-            self.stops += 1
-
-    def acknowledge(self, stops: int) -> None:
-        """Acknowledge the first ``stops`` of all stops; a later one stays latched."""
-        with self._lock:
-            self._acknowledged = max(self._acknowledged, stops)
-
-    def check(self) -> None:
-        """Raise MotionStopped while the stop is not acknowledged."""
-        if self.stopped:
-            raise MotionStopped(
-                "rig.stop() was called", "call rig.rearm() when it is safe to move again", code=Trip.STOP.code
-            )

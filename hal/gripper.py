@@ -137,7 +137,8 @@ class Gripper:
         Args:
             width: Distance between the fingers at the end, m.
             speed: Speed, m/s, up to the gripper's own, which is the default.
-            force: Greatest force on an object in between, N; the gripper's default if left out.
+            force: Greatest force on an object in between, N, up to the model's ``force_max``; the gripper's default if
+                left out.
         """
         return self._start_motion(GripperAct.MOVE, *self._checked(width, speed, force))
 
@@ -183,7 +184,7 @@ class Gripper:
         return (
             number("width", width, "m", least=0.0, most=self.spec.width_max),
             number("speed", speed, "m/s", least=0.0, above=True, most=self.spec.speed),
-            number("force", force, "N", least=0.0, above=True),
+            number("force", force, "N", least=0.0, above=True, most=self.spec.force_max or self.spec.force),
         )
 
     def _start_motion(self, act: GripperAct, *numbers: float) -> GripperMotion:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 from . import registry
 from .camera import Camera, place_of
 from .clock import Clock, LockStepClock, RealClock
-from .deadman import StopLatch
+from .commands import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper

@@ -101,6 +101,8 @@ class GripperSpec:
     widths: tuple[tuple[float, float], ...] = ()
     """Pairs of a position of the first joint (rad or m) and the width there, m, from closed to open; empty where the
     width is proportional to the way of the joints."""
+    force_max: float = 0.0
+    """Greatest grip force, N; 0 for :attr:`force`."""
     options: dict[str, Any] = field(default_factory=dict)
 
     @property

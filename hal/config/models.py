@@ -148,6 +148,8 @@ class GripperModel(Strict):
     """Greatest speed of the width, m/s."""
     force: Force
     """Grip force, N."""
+    force_max: Force | None = None
+    """Greatest force that a rig or a call may set, N; ``force`` if it is left out."""
     real: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
 
@@ -156,8 +158,15 @@ class GripperModel(Strict):
         """Names of the finger joints."""
         return tuple(joint.name for joint in self.joints)
 
+    @property
+    def strongest(self) -> float:
+        """Greatest grip force, N."""
+        return self.force if self.force_max is None else self.force_max
+
     @model_validator(mode="after")
     def _both_ends(self) -> GripperModel:
+        if self.force > self.strongest:
+            raise ValueProblem(f"force must be at most force_max, {self.strongest:g} N", "out_of_range")
         given = [end is not None for joint in self.joints for end in (joint.open, joint.closed)]
         if any(given) and not all(given):
             raise ValueProblem("every joint, or none, needs open and closed", "missing_key")

@@ -526,6 +526,10 @@ def _check_gripper(context: Context, key: str, config: RobotConfig, model: Robot
             if own.enabled and own.speed is not None and own.speed > kind.speed:
                 message = f"must be at most {kind.speed:g} m/s, the model's, not {own.speed:g}"
                 context.problem(f"{key}.speed", message, "looser_limit")
+        with suppress(Unknown):
+            if own.enabled and own.force is not None and own.force > kind.strongest:
+                message = f"must be at most {kind.strongest:g} N, the model's force_max, not {own.force:g}"
+                context.problem(f"{key}.force", message, "looser_limit")
         if own.enabled:
             if context.simulated(own, config) and not context.simulated(config):
                 message = "is simulated, but its arm is real: its fingers would be in another world"
@@ -556,6 +560,7 @@ def _gripper(
         opened=tuple(joint.open for joint in kind.joints if joint.open is not None),
         closed=tuple(joint.closed for joint in kind.joints if joint.closed is not None),
         widths=tuple((row[0], row[1]) for row in kind.widths),
+        force_max=kind.strongest,
         options=options,
     )
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from .. import registry
-from ..deadman import StopLatch
+from ..commands import StopLatch
 from ..errors import ConnectionLost, HalError
 from ..specs import GripperSpec, GroupSpec, RobotSpec, to_json
 from .cycle import STOP_LIMIT, Cycle

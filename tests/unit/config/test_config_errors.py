@@ -168,6 +168,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         (robot(limits={"lower": -3.0}), "robots.arm.limits.lower", "looser_limit"),
         (robot(limits={"velocity": -1.0}), "robots.arm.limits.velocity", "out_of_range"),
         (robot(gripper={"speed": 0.9}), "robots.arm.gripper.speed", "looser_limit"),
+        (robot(gripper={"force": 100}), "robots.arm.gripper.force", "looser_limit"),
         pytest.param(
             {"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}},
             "robots.a.gripper",

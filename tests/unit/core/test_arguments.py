@@ -71,6 +71,7 @@ WRONG = {
     "arm.gripper.start(0.09)": "width must be",
     "arm.gripper.start(np.array([0.05]))": "width must be",
     "arm.gripper.start(0.05, force=HUGE)": "force must be",
+    "arm.gripper.start(0.05, force=71.0)": "force must be",
     "arm.gripper.grip(1.5)": "grip",
     "arm.gripper.grip('x')": "grip",
     "arm.gripper.state(NAN)": "max_age must be",
