@@ -39,7 +39,7 @@ _RATED_COMMANDS = 200
 """Commands after which the success rate, an average of the last 100 cycles, is recorded."""
 _NO_TORQUE = (0.0,) * 7
 _MAX_START_SPEED = 5e-3
-"""Largest speed of a motion's first set-point, rad/s (5 rad/s2 for one cycle): a motion starts at rest."""
+"""Largest speed of the first set-point of a motion by positions, rad/s (5 rad/s2 for one cycle): it starts at rest."""
 _DRIFT = 1e-6
 """Largest distance of a velocity controller's own position from the set-points, rad, unless one was lost."""
 _NOT_SHOWN: tuple[ArmMode | None, Fault | None] = (None, None)
@@ -131,8 +131,10 @@ class FrankaArm(RobotDriver):
         if self._fault is not None or s.mode not in _READY_MODES:
             return False
         kind = self._kind(setpoint)
-        if link.motion is None and max(map(abs, setpoint.dq)) > _MAX_START_SPEED:
-            return False  # the robot ended the last motion: the servo has to come to rest first
+        # The robot ended the last motion: positions have to come to rest first. Torques begin with none, and the speed
+        # in their set-points is the measured one, of an arm that may not have settled.
+        if link.motion is None and setpoint.tau is None and max(map(abs, setpoint.dq)) > _MAX_START_SPEED:
+            return False
         try:
             if link.motion is not kind:
                 self._start_motion(link, kind, s, setpoint)

@@ -231,8 +231,7 @@ class ArmUnit:
                     driver.engage()
                 self.servo.note_withheld()
                 return
-            if driver.write(setpoint) is False:
-                self.servo.note_withheld()
+            self.servo.note_written(driver.write(setpoint) is not False)
         except Exception as error:
             self._write_failed = True
             self._lose(error)

@@ -87,6 +87,9 @@ _ABSURD = 1e3
 _BEYOND = 1.0
 """Joint positions this far beyond the joint's range are an invalid reading, rad."""
 
+WITHHELD = 0.3
+"""Longest time for which a driver may hold back the set-points of an arm that is to move, s."""
+
 
 class Servo:
     """Makes the set-points of one arm, once per ``dt`` seconds."""
@@ -143,6 +146,8 @@ class Servo:
         self._ending = False
         self._followed = False
         """Whether a motion moved the arm in the last tick."""
+        self._withheld = 0.0
+        """Time for which the driver has held back the set-points of such a motion, s."""
         self._t_tick: float | None = None
         """Time of the last tick, s."""
         self._seq = 0
@@ -305,12 +310,26 @@ class Servo:
 
     @property
     def fault(self) -> Fault | None:
-        """Set if what the device reports does not fit its set-points, until :meth:`recover`; the arm is stopped."""
+        """Set if the device does not take its set-points as it should, until :meth:`recover`; the arm is stopped."""
         return self._anchoring.fault
 
     def recover(self) -> None:
         """Clear :attr:`fault`, and learn again how the device reports its set-points."""
         self._anchoring.recover()
+
+    def note_written(self, taken: bool) -> None:
+        """Note whether the driver passed the last set-point on; one that goes on holding back an arm's motion fails."""
+        if taken:
+            self._withheld = 0.0
+            return
+        self.note_withheld()
+        self._withheld = self._withheld + self._smoother.dt if self._followed else 0.0
+        if self._withheld > WITHHELD:
+            self._anchoring.fault = Fault(
+                "SETPOINTS_WITHHELD",
+                f"the arm was to move, but for {WITHHELD:g} s its driver passed no set-point on",
+                "check that the arm is at rest, and in its own software that it accepts motions",
+            )
 
     def note_withheld(self) -> None:
         """Note that the driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""

@@ -313,6 +313,26 @@ def test_a_device_that_takes_no_setpoints_is_lost_and_does_not_leap(rig: hal.Rig
     assert audit(rig, arm)["velocity"] <= 1.0
 
 
+def test_an_arm_whose_driver_passes_no_set_point_on_is_a_fault(rig: hal.Rig, arm: hal.Robot) -> None:
+    driver = rig.driver("panda")
+    write = driver.write
+    with arm.control() as control:
+        rig.clock.sleep(0.1)
+        driver.write = lambda setpoint: False
+        rig.clock.sleep(0.5)  # an arm that is to hold may wait
+        with pytest.raises(RobotFault):
+            drive(rig, control)
+        assert control.trip is Trip.FAULT
+        assert arm.state().fault.code == "SETPOINTS_WITHHELD"
+        driver.write = write
+        arm.recover()
+        rig.clock.sleep(0.1)
+        control.rearm()
+        drive(rig, control)
+        assert arm.state().status is RobotStatus.FOLLOWING
+    assert audit(rig, arm)["velocity"] <= 1.0
+
+
 def test_a_stop_that_no_call_reported_is_a_warning(rig: hal.Rig, arm: hal.Robot) -> None:
     with pytest.warns(RuntimeWarning, match="panda was stopped"), arm.control() as control:
         control.send(JointTarget(arm.state().q))
