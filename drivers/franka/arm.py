@@ -169,11 +169,12 @@ class FrankaArm(RobotDriver):
 
     def _start_motion(self, link: ArmLink, kind: StreamKind, s: ArmSample, setpoint: Setpoint) -> None:
         """Start a motion of this kind, or end the one that is running."""
+        held = link.motion is not StreamKind.TORQUE
         if link.motion is not None:
             link.finish()
         if link.motion is None:  # a library with its own loop ends a motion when the cycle returns to it
             self._connection.configure(s)
-            link.still = setpoint.q
+            link.still = setpoint.q if held else None  # torques may have moved the arm on since it was measured
             link.start(kind)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:

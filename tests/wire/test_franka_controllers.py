@@ -44,3 +44,21 @@ def test_an_arm_rests_at_its_set_point(emulator: Emulator, robot: str, controlle
         assert np.abs(arm.state().q - rest.q).max() < 2e-3
     assert not emulator.events("reflex")
     assert "success" in emulator.events("motion ended")[-1]["text"]
+
+
+def test_every_session_starts_on_an_arm_that_has_not_settled(fr3: Emulator) -> None:
+    with rig_of(fr3.host, "fr3", lock_step=True) as rig:
+        arm = arm_of(rig)
+        for seed in range(50):
+            fr3.control.send(f"unrest {seed}")
+            rig.clock.sleep(0.01)
+            with arm.control(rate_hz=50, unattended=True, controller=CONTROLLERS[seed % 2]) as control:
+                control.send(hal.Twist([0.0, 0.0, 0.05 if seed % 4 < 2 else -0.05]))
+                rig.clock.sleep(0.05)
+                state = fr3.control.send("state")
+                assert (state["controller"], state["mode"]) == ("external", "move"), (
+                    f"session {seed}: {fr3.events()[-3:]}"
+                )
+                assert state["commands"] > 30
+                assert arm.state().controller is not hal.ControlMode.POSITION
+    assert not fr3.events("reflex")

@@ -163,6 +163,8 @@ class Executor:
             "report-lag": self._report_lag,
             "report-noise": self._report_noise,
             "report-measured": self._report_measured,
+            "spoil": self._spoil,
+            "unrest": lambda words: server.arm.unrest.set(None if words == ["off"] else int(*_exactly(words, 1))),
             "truncate": self._truncate,
             "reflex": self._reflex,
             "user-stop": lambda words: server.arm.user_stop(_switch(words)),
@@ -215,6 +217,12 @@ class Executor:
 
     def _report_measured(self, words: Words) -> None:
         self._server.arm.reports.measured = _switch(words)
+
+    def _spoil(self, words: Words) -> None:
+        field, value = _exactly(words, 2)
+        if value not in ("nan", "inf", "off"):
+            raise ValueError("takes nan, inf or off")
+        self._server.arm.spoil(field, None if value == "off" else float(value))
 
     def _truncate(self, words: Words) -> None:
         self._server.faults.truncate = _switch(words)
