@@ -112,10 +112,8 @@ class MockRobot(RobotDriver):
         dq = tuple(self._follows.dq) if moved else (0.0,) * n
         if faults.garbage == "short":
             q, dq = q[:-1], dq[:-1]
-        elif faults.garbage is not None:
-            q = (float(faults.garbage), *q[1:])
         fault = None if faults.fault is None else Fault("mock", faults.fault, "call recover() on the arm")
-        return Reading(
+        reading = Reading(
             t,
             t_device,
             self._seq,
@@ -128,6 +126,10 @@ class MockRobot(RobotDriver):
             fault=fault,
             tau_commanded=self._commanded.tau,
         )
+        if faults.garbage in (None, "short"):
+            return reading
+        size = 6 if faults.garbage_in == "wrench_ext" else n
+        return reading._replace(**{faults.garbage_in: (float(faults.garbage), *(0.0,) * (size - 1))})
 
     def write(self, setpoint: Setpoint) -> None:
         self._expect_open()

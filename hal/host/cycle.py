@@ -266,7 +266,7 @@ class ArmUnit:
     def publish(self, now: float) -> None:
         """Publish the newest valid reading, with the state of the servo."""
         reading, report = self.reading, self.servo.report
-        if reading is not None and self._makes_sense(reading):
+        if self.servo.known:
             self._sound = reading
         reading = self._sound
         if reading is None:
@@ -297,10 +297,6 @@ class ArmUnit:
             report.overrun,
         )
         self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
-
-    def _makes_sense(self, reading: Reading) -> bool:
-        n = len(self.spec.joints)
-        return len(reading.q) == len(reading.dq) == n and math.isfinite(math.hypot(*reading.q, *reading.dq))
 
     # Requests.
 

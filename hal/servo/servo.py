@@ -146,6 +146,8 @@ class Servo:
         self._ending = False
         self._followed = False
         """Whether a motion moved the arm in the last tick."""
+        self.known = True
+        """Whether the numbers of the last reading are valid."""
         self._withheld = 0.0
         """Time for which the driver has held back the set-points of such a motion, s."""
         self._t_tick: float | None = None
@@ -283,7 +285,7 @@ class Servo:
         if session is None:
             self._anchoring.note_rest(None if device else reading.q_commanded)
         torque = self._torque
-        known = self._is_known(reading, device)
+        self.known = known = self._is_known(reading, device)
         if torque.active:
             torque.observe(reading if known else None)
             device = device or self._overruns()
@@ -395,7 +397,7 @@ class Servo:
         if reading.fault is not None or self._anchoring.fault is not None:
             return Trip.FAULT
         smoother = self._smoother
-        if not (self._is_position(reading.q) and self._is_sound(reading.dq)):
+        if not self._is_possible(reading):
             return Trip.BAD_READING
         q, dq = reading.q_commanded, reading.dq_commanded
         # A device that reports exactly what it was given needs no second check.
@@ -412,14 +414,19 @@ class Servo:
     def _is_known(self, reading: Reading, device: Trip) -> bool:
         """Return whether the numbers of this reading are valid, given the trip ``device`` that it causes."""
         if device is Trip.FAULT:
-            sound = self._is_position(reading.q) and self._is_sound(reading.dq)
-            return sound and self._has_sound_torques(reading)
+            return self._is_possible(reading) and self._has_sound_torques(reading)
         return not device
 
     def _has_sound_torques(self, reading: Reading) -> bool:
         """Return whether the commanded torques in this reading, from which the next ones step on, can be used."""
         tau = reading.tau_commanded
-        return tau is None or not self._torque.active or (len(tau) == self._smoother.n and isfinite(hypot(*tau)))
+        return tau is None or not self._torque.active or len(tau) == self._smoother.n
+
+    def _is_possible(self, reading: Reading) -> bool:
+        """Return whether the measured values of this reading are possible, and all of its torques and forces finite."""
+        torques = *(reading.tau or ()), *(reading.tau_ext or ()), *(reading.tau_commanded or ())
+        finite = isfinite(hypot(*torques, *(reading.wrench_ext or ())))
+        return finite and self._is_position(reading.q) and self._is_sound(reading.dq)
 
     def _overruns(self) -> Trip:
         """Return ``Trip.LIMIT`` if an arm that follows torques, or is braked by them, runs into a limit."""

@@ -24,6 +24,7 @@ from hal import (
     Trip,
     Twist,
 )
+from hal.drivers.mock.faults import FIELDS
 from hal.drivers.mock.robot import MockRobot
 from hal.servo.audit import SetpointAudit
 
@@ -280,12 +281,17 @@ def test_a_fault_stops_until_the_user_recovers(rig: hal.Rig, arm: hal.Robot) -> 
         control.send(TURN)
 
 
-def test_impossible_values_from_an_arm_trip(rig: hal.Rig, arm: hal.Robot) -> None:
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("garbage", ["nan", "inf"])
+def test_impossible_values_from_an_arm_trip(rig: hal.Rig, arm: hal.Robot, garbage: str, field: str) -> None:
     with pytest.warns(RuntimeWarning, match="impossible"), arm.control() as control:
         drive(rig, control, count=10)
-        arm.inject(garbage="nan")
+        arm.inject(garbage=garbage, garbage_in=field)
         rig.clock.sleep(0.3)
         assert control.trip is Trip.BAD_READING
+        state = arm.state(max_age=1.0)
+        values = [state.q, state.dq, state.tau, state.tau_ext, state.wrench_ext, state.q_set]
+        assert all(np.isfinite(value).all() for value in values if value is not None)
         arm.inject(garbage=None)
 
 
