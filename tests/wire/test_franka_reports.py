@@ -122,3 +122,22 @@ def test_reports_that_fit_nothing_are_a_fault_with_a_name(fr3: Emulator) -> None
     again = drive(fr3)  # nothing is left of it
     assert again.travel > 0.2
     assert not again.error
+
+
+def test_numbers_that_are_not_finite_stop_the_arm(fr3: Emulator) -> None:
+    with rig_of(fr3.host, lock_step=True) as rig:
+        arm = arm_of(rig)
+        for field in ("q", "dq", "tau_J", "q_d", "dq_d", "tau_ext_hat_filtered", "O_F_ext_hat_K"):
+            for value in ("nan", "inf"):
+                with (
+                    pytest.warns(RuntimeWarning, match="impossible"),
+                    arm.control(rate_hz=10, unattended=True) as control,
+                ):
+                    control.send(hal.Twist([0.0, 0.05, 0.0]))
+                    rig.clock.sleep(0.05)
+                    assert control.trip is hal.Trip.NONE
+                    fr3.control.send(f"spoil {field} {value}")
+                    rig.clock.sleep(0.01)
+                    assert control.trip is hal.Trip.BAD_READING, (field, value)
+                    fr3.control.send(f"spoil {field} off")
+    assert not fr3.events("reflex")
