@@ -169,6 +169,7 @@ class ArmUnit:
 
     def _lose(self, error: Exception) -> None:
         """Count the device as lost, whatever error its driver raised."""
+        self.audit.reset()  # what is not written is a gap in the stream
         if isinstance(error, ConnectionLost):
             self.error = error
             return

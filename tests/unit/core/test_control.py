@@ -319,6 +319,19 @@ def test_a_device_that_takes_no_setpoints_is_lost_and_does_not_leap(rig: hal.Rig
     assert audit(rig, arm)["velocity"] <= 1.0
 
 
+def test_what_was_not_written_to_a_lost_arm_is_no_peak(rig: hal.Rig, arm: hal.Robot) -> None:
+    with arm.control() as control:
+        drive(rig, control)
+        arm.inject(disconnect=True)
+        rig.clock.sleep(0.06)
+        arm.inject(disconnect=False)
+        rig.clock.sleep(0.3)
+        control.rearm()
+        drive(rig, control)
+        peak = next(iter(rig.statistics().values()))["robots"]["panda"]["peak"]
+    assert all(0.0 < share <= 1.0 for share in peak.values()), peak
+
+
 def test_an_arm_whose_driver_passes_no_set_point_on_is_a_fault(rig: hal.Rig, arm: hal.Robot) -> None:
     driver = rig.driver("panda")
     write = driver.write
