@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from hal.driver import GripperDriver, GripperReading, Reading, RobotDriver, Setpoint
 from hal.errors import CommandError, ConnectionLost, Fault
@@ -129,7 +129,8 @@ class MockRobot(RobotDriver):
         if faults.garbage in (None, "short"):
             return reading
         size = 6 if faults.garbage_in == "wrench_ext" else n
-        return reading._replace(**{faults.garbage_in: (float(faults.garbage), *(0.0,) * (size - 1))})
+        spoilt: dict[str, Any] = {faults.garbage_in: (float(faults.garbage), *(0.0,) * (size - 1))}
+        return reading._replace(**spoilt)
 
     def write(self, setpoint: Setpoint) -> None:
         self._expect_open()
