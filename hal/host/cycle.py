@@ -267,7 +267,7 @@ class ArmUnit:
     def publish(self, now: float) -> None:
         """Publish the newest valid reading, with the state of the servo."""
         reading, report = self.reading, self.servo.report
-        if self.servo.known:
+        if self.servo.possible:
             self._sound = reading
         reading = self._sound
         if reading is None:

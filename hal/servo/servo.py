@@ -30,7 +30,7 @@ from .joint import ChunkMotion, JointTargetMotion, JointVelocityMotion, PathMoti
 from .planned import PlannedMotion
 from .smoothing import JointSmoother
 from .torque import BRAKE_LIMIT, MassMatrix, TorqueMotion
-from .watchdog import SILENCE, Watchdog, is_alive, is_timely
+from .watchdog import SILENCE, WITHHELD, WITHHELD_FAULT, Watchdog, is_alive, is_timely
 
 __all__ = [
     "Servo",
@@ -86,9 +86,6 @@ _ABSURD = 1e3
 
 _BEYOND = 1.0
 """Joint positions this far beyond the joint's range are an invalid reading, rad."""
-
-WITHHELD = 0.3
-"""Longest time for which a driver may hold back the set-points of an arm that is to move, s."""
 
 
 class Servo:
@@ -146,8 +143,8 @@ class Servo:
         self._ending = False
         self._followed = False
         """Whether a motion moved the arm in the last tick."""
-        self.known = True
-        """Whether the numbers of the last reading are valid."""
+        self.possible = True
+        """Whether the numbers of the last reading are possible, even if they are old."""
         self._withheld = 0.0
         """Time for which the driver has held back the set-points of such a motion, s."""
         self._t_tick: float | None = None
@@ -285,7 +282,8 @@ class Servo:
         if session is None:
             self._anchoring.note_rest(None if device else reading.q_commanded)
         torque = self._torque
-        self.known = known = self._is_known(reading, device)
+        known = self._is_known(reading, device)
+        self.possible = known or device is Trip.DEVICE_LOST
         if torque.active:
             torque.observe(reading if known else None)
             device = device or self._overruns()
@@ -327,11 +325,7 @@ class Servo:
         self.note_withheld()
         self._withheld = self._withheld + self._smoother.dt if self._followed else 0.0
         if self._withheld > WITHHELD:
-            self._anchoring.fault = Fault(
-                "SETPOINTS_WITHHELD",
-                f"the arm was to move, but for {WITHHELD:g} s its driver passed no set-point on",
-                "check that the arm is at rest, and in its own software that it accepts motions",
-            )
+            self._anchoring.fault = WITHHELD_FAULT
 
     def note_withheld(self) -> None:
         """Note that the driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
