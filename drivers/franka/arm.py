@@ -40,7 +40,7 @@ _RATED_COMMANDS = 200
 """Commands after which the success rate, an average of the last 100 cycles, is recorded."""
 _NO_TORQUE = (0.0,) * 7
 _MAX_START_SPEED = 5e-3
-"""Largest speed of a motion's first set-point, rad/s (5 rad/s2 for one cycle): a motion starts at rest."""
+"""Largest speed of the first set-point of a motion by positions, rad/s (5 rad/s2 for one cycle): it starts at rest."""
 _NOT_SHOWN: tuple[ArmMode | None, Fault | None] = (None, None)
 _READY_MODES = frozenset({ArmMode.IDLE, ArmMode.MOVE})
 _MANUAL_MODES = frozenset({ArmMode.USER_STOPPED, ArmMode.GUIDING, ArmMode.OTHER})
@@ -132,7 +132,8 @@ class FrankaArm(RobotDriver):
             self.withheld["not ready"] += 1
             return False
         kind = self._kind(setpoint)
-        # The robot ended the last motion: the servo has to come to rest first. Torques have no set-point that moves.
+        # The robot ended the last motion: positions have to come to rest first. Torques begin with none, and the speed
+        # in their set-points is the measured one, of an arm that may not have settled.
         if link.motion is None and setpoint.tau is None and max(map(abs, setpoint.dq)) > _MAX_START_SPEED:
             self.withheld["no motion begins at a speed"] += 1
             return False
@@ -169,11 +170,12 @@ class FrankaArm(RobotDriver):
 
     def _start_motion(self, link: ArmLink, kind: StreamKind, s: ArmSample, setpoint: Setpoint) -> None:
         """Start a motion of this kind, or end the one that is running."""
+        held = link.motion is not StreamKind.TORQUE
         if link.motion is not None:
             link.finish()
         if link.motion is None:  # a library with its own loop ends a motion when the cycle returns to it
             self._connection.configure(s)
-            link.still = setpoint.q
+            link.still = setpoint.q if held else None  # torques may have moved the arm on since it was measured
             link.start(kind)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:

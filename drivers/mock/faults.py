@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from hal.errors import CommandError
 
-__all__ = ["MockCameraFaults", "MockGripperFaults", "MockPadFaults", "MockRobotFaults", "with_faults"]
+__all__ = ["FIELDS", "MockCameraFaults", "MockGripperFaults", "MockPadFaults", "MockRobotFaults", "with_faults"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class MockRobotFaults:
     """Every call except ``close`` raises ConnectionLost, and the arm stops where it is."""
     garbage: str | None = None
     """Invalid readings: ``nan``, ``inf``, or ``short`` (one joint too few)."""
+    garbage_in: str = "q"
+    """The field of :class:`~hal.driver.Reading` that begins with that ``nan`` or ``inf``."""
     fault: str | None = None
     """The arm reports a fault with this cause and ignores set-points, until ``recover()``."""
     tau_ext: Sequence[float] | None = None
@@ -80,6 +82,8 @@ class MockPadFaults:
     """The pad is unplugged: readings with ``connected=False``, sticks centred and no button pressed."""
 
 
+FIELDS = ("q", "dq", "tau", "q_commanded", "dq_commanded", "tau_ext", "wrench_ext", "tau_commanded")
+"""Fields of a reading that hold numbers of joints, or a wrench."""
 _GARBAGE = {
     MockRobotFaults: ("nan", "inf", "short"),
     MockGripperFaults: ("nan", "inf"),
@@ -112,6 +116,8 @@ def _expected(name: str, value: object, garbage: Sequence[str]) -> str | None:
     """Return what the fault's value must be; None where ``value`` is right."""
     if name == "garbage" and value is not None and value not in garbage:
         return f"one of {', '.join(garbage)} or None"
+    if name == "garbage_in" and value not in FIELDS:
+        return f"one of {', '.join(FIELDS)}"
     if name in ("freeze", "disconnect", "stuck") and not isinstance(value, bool):
         return "True or False"
     if name == "drop" and not (type(value) is int and value >= 0):

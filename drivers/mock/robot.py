@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from hal.driver import GripperDriver, GripperReading, Reading, RobotDriver, Setpoint
 from hal.errors import CommandError, ConnectionLost, Fault
@@ -111,10 +111,8 @@ class MockRobot(RobotDriver):
         dq = tuple(self._follows.dq) if moved else (0.0,) * n
         if faults.garbage == "short":
             q, dq = q[:-1], dq[:-1]
-        elif faults.garbage is not None:
-            q = (float(faults.garbage), *q[1:])
         fault = None if faults.fault is None else Fault("mock", faults.fault, "call recover() on the arm")
-        return Reading(
+        reading = Reading(
             t,
             t_device,
             self._seq,
@@ -127,6 +125,11 @@ class MockRobot(RobotDriver):
             fault=fault,
             tau_commanded=self._commanded.tau,
         )
+        if faults.garbage in (None, "short"):
+            return reading
+        size = 6 if faults.garbage_in == "wrench_ext" else n
+        spoilt: dict[str, Any] = {faults.garbage_in: (float(faults.garbage), *(0.0,) * (size - 1))}
+        return reading._replace(**spoilt)
 
     def write(self, setpoint: Setpoint) -> None:
         self._expect_open()

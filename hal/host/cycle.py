@@ -136,6 +136,7 @@ class ArmUnit:
 
     def _lose(self, error: Exception) -> None:
         """Count the device as lost, whatever error its driver raised."""
+        self.audit.reset()  # what is not written is a gap in the stream
         if isinstance(error, ConnectionLost):
             self.error = error
             return
@@ -196,8 +197,7 @@ class ArmUnit:
                     driver.engage()
                 self.servo.note_withheld()
                 return
-            if driver.write(setpoint) is False:
-                self.servo.note_withheld(by_driver=True)
+            self.servo.note_written(driver.write(setpoint) is not False)
         except Exception as error:
             self._write_failed = True
             self._lose(error)
@@ -236,7 +236,7 @@ class ArmUnit:
     def publish(self, now: float) -> None:
         """Publish the newest valid reading, with the state of the servo."""
         reading, report, watchdog = self.reading, self.servo.report, self.servo.watchdog
-        if reading is not None and self._makes_sense(reading):
+        if self.servo.possible:
             self._sound = reading
         reading = self._sound
         if reading is None:
@@ -270,11 +270,6 @@ class ArmUnit:
             watchdog.allowed,
         )
         self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
-
-    def _makes_sense(self, reading: Reading) -> bool:
-        n = len(self.spec.joints)
-        forces = (*(reading.tau or ()), *(reading.tau_ext or ()), *(reading.wrench_ext or ()))
-        return len(reading.q) == len(reading.dq) == n and math.isfinite(sum((*reading.q, *reading.dq, *forces)))
 
     # Requests.
 

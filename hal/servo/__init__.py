@@ -6,6 +6,7 @@ every limit; ``anchoring`` checks whether the device took the last one; ``contro
 of it where a session has a controller; ``audit`` recomputes from what the driver was given whether limits were kept.
 """
 
-from .servo import Servo, ServoReport
+from .report import ServoReport
+from .servo import Servo
 
 __all__ = ["Servo", "ServoReport"]

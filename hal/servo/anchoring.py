@@ -23,7 +23,7 @@ from ..types import Trip
 from .smoothing import JointSmoother, stop_peak
 from .watchdog import SILENCE
 
-__all__ = ["LATEST", "MISMATCHES", "NOISIEST", "WITHHELD", "Anchoring"]
+__all__ = ["LATEST", "MISMATCHES", "NOISIEST", "Anchoring"]
 
 Floats = Sequence[float]
 LATEST = 5
@@ -38,9 +38,6 @@ MISMATCHES = 20
 
 _WINDOW = 100
 """Cycles."""
-
-WITHHELD = 0.3
-"""An arm that is to move, and whose driver passes no set-point on for this long, has a fault, s."""
 
 _LONGEST = 20
 """A device that got no set-point for so many cycles has stopped by itself."""
@@ -88,8 +85,6 @@ class Anchoring:
         self._rests = 0
         self._steps = 0.0
         """Number of these reports, and the difference between two consecutive ones, rad."""
-        self._number = self._held_at = self._held = 0
-        """Set-points so far, the last one of them that was withheld, and how many were in a row."""
         self.reset_statistics()
         self.recover()
         self.forget()
@@ -162,24 +157,11 @@ class Anchoring:
         """Note that this set-point is written to the device."""
         self._motion = setpoint
         self._given.appendleft(setpoint[0])
-        self._number += 1
         self._fresh = False
 
-    def note_withheld(self, moves: bool) -> None:
-        """Note that the last set-point was not passed on: the device is where it reports to be.
-
-        Args:
-            moves: Whether the driver held it back although the arm is to move: a fault after :data:`WITHHELD` s.
-        """
+    def note_withheld(self) -> None:
+        """Note that the last set-point was not passed on: the device is where it reports to be."""
         self._silent = self._withheld = True
-        self._held = self._held + 1 if moves and self._number == self._held_at + 1 else int(moves)
-        self._held_at = self._number
-        if self._held * self._smoother.dt > WITHHELD:
-            self.fault = Fault(
-                "SETPOINTS_WITHHELD",
-                f"the driver passed none of the set-points of the last {WITHHELD:g} s on, although the arm was to move",
-                "rig.statistics() has the driver's reasons; begin a new session from rest",
-            )
 
     def note_silence(self) -> None:
         """Note that the device did not answer in this cycle. It stops by itself if that lasts."""

@@ -10,7 +10,6 @@ that must not follow is brought to rest by the smoother's time-optimal stop and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import dist, hypot, isfinite
 from typing import Any
 
@@ -28,53 +27,14 @@ from .controllers import Controller
 from .envelope import Envelope
 from .joint import ChunkMotion, JointTargetMotion, JointVelocityMotion, PathMotion, ServoMotion
 from .planned import PlannedMotion
+from .report import ServoReport
 from .smoothing import JointSmoother
 from .torque import BRAKE_LIMIT, MassMatrix, TorqueMotion
-from .watchdog import SILENCE, Watchdog, is_alive, is_timely
+from .watchdog import SILENCE, WITHHELD, WITHHELD_FAULT, Watchdog, is_alive, is_timely
 
-__all__ = [
-    "Servo",
-    "ServoReport",
-]
+__all__ = ["Servo"]
 
 Floats = Sequence[float]
-
-
-@dataclass(slots=True)
-class ServoReport:
-    """State of a servo after its last tick."""
-
-    status: RobotStatus = RobotStatus.IDLE
-    trip: Trip = Trip.NONE
-    limited: Limited = Limited.NONE
-    target_seq: int = 0
-    """Number of the command that the set-point follows; 0 before the first one of a session."""
-    refused: int = 0
-    """Number of the newest command of this session that was refused; 0 for none."""
-    q_set: Floats = ()
-    """Joint set-point (n,), rad."""
-    dq_set: Floats = ()
-    ddq_set: Floats = ()
-    reanchored: int = 0
-    """Number of set-points that the device did not take, since the servo was made."""
-    arrived: bool = False
-    """Whether the motion of the session (``move_to`` and its kin) has reached its goal."""
-    progress: float = 0.0
-    """Share of the session's motion that is done, from 0 to 1."""
-    held_back: Limited = Limited.NONE
-    """Limits by which the servo reduced the motion of the session, since it was opened."""
-    off_path: bool = False
-    """Whether the arm cannot continue on the path of its session: it was moved too far off, or no plan leads on."""
-    overrun: Limited = Limited.NONE
-    """Limit that the arm reached when ``Trip.LIMIT`` was latched; ``NONE`` if it could not be braked."""
-    t_trip: float = 0.0
-    """Time at which the stop was latched, s."""
-    t_stop: float = 0.0
-    """Time at which the last braking began, s."""
-    controller: ControlMode = ControlMode.POSITION
-    """What makes the arm follow its set-point."""
-    tau_set: Floats = ()
-    """Torques (n,) of the last set-point, Nm; empty if it has none."""
 
 
 # Members of enumerations that every tick names: a global is found faster than a member.
@@ -143,6 +103,10 @@ class Servo:
         self._ending = False
         self._followed = False
         """Whether a motion moved the arm in the last tick."""
+        self.possible = True
+        """Whether the numbers of the last reading are possible, even if they are old."""
+        self._withheld = 0.0
+        """Time for which the driver has held back the set-points of such a motion, s."""
         self._t_tick: float | None = None
         """Time of the last tick, s."""
         self._seq = 0
@@ -280,6 +244,7 @@ class Servo:
             self._anchoring.note_rest(None if device else reading.q_commanded)
         torque = self._torque
         known = self._is_known(reading, device)
+        self.possible = known or device is Trip.DEVICE_LOST
         if torque.active:
             torque.observe(reading if known else None)
             device = device or self._overruns()
@@ -345,20 +310,26 @@ class Servo:
 
     @property
     def fault(self) -> Fault | None:
-        """Set if what the device reports does not fit its set-points, until :meth:`recover`; the arm is stopped."""
+        """Set if the device does not take its set-points as it should, until :meth:`recover`; the arm is stopped."""
         return self._anchoring.fault
 
     def recover(self) -> None:
         """Clear :attr:`fault`."""
         self._anchoring.recover()
 
-    def note_withheld(self, by_driver: bool = False) -> None:
-        """Note that the last set-point was not passed on.
+    def note_written(self, taken: bool) -> None:
+        """Note whether the driver passed the last set-point on; one that goes on holding back an arm's motion fails."""
+        if taken:
+            self._withheld = 0.0
+            return
+        self.note_withheld()
+        self._withheld = self._withheld + self._smoother.dt if self._followed else 0.0
+        if self._withheld > WITHHELD:
+            self._anchoring.fault = WITHHELD_FAULT
 
-        Args:
-            by_driver: Whether the driver held it back (see :meth:`.RobotDriver.write`), which must not last.
-        """
-        self._anchoring.note_withheld(by_driver and self._followed)
+    def note_withheld(self) -> None:
+        """Note that the driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
+        self._anchoring.note_withheld()
 
     def statistics(self) -> dict[str, Any]:
         """Return what became of the set-points: ``lost``, ``skipped``, ``mismatches``, ``report_error`` (rad)."""
@@ -394,7 +365,7 @@ class Servo:
         if reading.fault is not None or self._anchoring.fault is not None:
             return Trip.FAULT
         smoother = self._smoother
-        if not (self._is_position(reading.q) and self._is_sound(reading.dq)):
+        if not self._is_possible(reading):
             return Trip.BAD_READING
         q, dq = reading.q_commanded, reading.dq_commanded
         # A device that reports exactly what it was given needs no second check.
@@ -404,9 +375,6 @@ class Servo:
             return Trip.BAD_READING
         if reading.tau_commanded is not None and not self._has_sound_torques(reading):
             return Trip.BAD_READING
-        for values in (reading.tau, reading.tau_ext, reading.wrench_ext):
-            if values is not None and not isfinite(sum(values)):
-                return Trip.BAD_READING
         if not is_alive(now, reading.t, self._torque.patience if self._torque.active else SILENCE):
             return Trip.DEVICE_LOST  # it repeats an old reading
         return _NO_TRIP
@@ -414,14 +382,19 @@ class Servo:
     def _is_known(self, reading: Reading, device: Trip) -> bool:
         """Return whether the numbers of this reading are valid, given the trip ``device`` that it causes."""
         if device is Trip.FAULT:
-            sound = self._is_position(reading.q) and self._is_sound(reading.dq)
-            return sound and self._has_sound_torques(reading)
+            return self._is_possible(reading) and self._has_sound_torques(reading)
         return not device
 
     def _has_sound_torques(self, reading: Reading) -> bool:
         """Return whether the commanded torques in this reading, from which the next ones step on, can be used."""
         tau = reading.tau_commanded
-        return tau is None or not self._torque.active or (len(tau) == self._smoother.n and isfinite(hypot(*tau)))
+        return tau is None or not self._torque.active or len(tau) == self._smoother.n
+
+    def _is_possible(self, reading: Reading) -> bool:
+        """Return whether the measured values of this reading are possible, and all of its torques and forces finite."""
+        torques = *(reading.tau or ()), *(reading.tau_ext or ()), *(reading.tau_commanded or ())
+        finite = isfinite(hypot(*torques, *(reading.wrench_ext or ())))
+        return finite and self._is_position(reading.q) and self._is_sound(reading.dq)
 
     def _overruns(self) -> Trip:
         """Return ``Trip.LIMIT`` if an arm that follows torques, or is braked by them, runs into a limit."""

@@ -6,9 +6,10 @@ Every comparison is written so that a number that is not finite counts as the ba
 from __future__ import annotations
 
 from ..commands import CommandRecord, DeadmanRecord, Inbox, Session
+from ..errors import Fault
 from ..types import Trip
 
-__all__ = ["PAD_SILENCE", "SILENCE", "Watchdog", "is_alive", "is_timely"]
+__all__ = ["PAD_SILENCE", "SILENCE", "WITHHELD", "WITHHELD_FAULT", "Watchdog", "is_alive", "is_timely"]
 
 SILENCE = 0.150
 """Longest time from the last sign of life of the dead-man's pad, of the app or of the device to the stop, s."""
@@ -24,6 +25,14 @@ _NONE = Trip.NONE  # the one that is named in every tick; it is zero, and so fal
 
 _AHEAD = 1.0
 """A sign of life may be this far in the future before it counts as invalid, s."""
+
+WITHHELD = 0.3
+"""Longest time for which a driver may hold back the set-points of an arm that is to move, s."""
+WITHHELD_FAULT = Fault(
+    "SETPOINTS_WITHHELD",
+    f"the arm was to move, but for {WITHHELD:g} s its driver passed no set-point on",
+    "check that the arm is at rest, and in its own software that it accepts motions",
+)
 
 
 class Watchdog:

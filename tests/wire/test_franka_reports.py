@@ -114,27 +114,20 @@ def test_reports_that_fit_nothing_are_a_fault_with_a_name(fr3: Emulator) -> None
     assert not again.error
 
 
-FIELDS = {
-    "q": "nan", "dq": "inf", "tau_J": "nan", "q_d": "inf", "dq_d": "nan", "tau_ext_hat_filtered": "nan",
-    "O_F_ext_hat_K": "inf",
-}  # fmt: skip
-
-
-def test_impossible_values_in_any_field_stop_the_arm(fr3: Emulator) -> None:
-    fr3.refresh()
-    with rig_of(fr3.host, "fr3", lock_step=True) as rig:
+def test_numbers_that_are_not_finite_stop_the_arm(fr3: Emulator) -> None:
+    with rig_of(fr3.host, lock_step=True) as rig:
         arm = arm_of(rig)
-        for field, value in FIELDS.items():
-            with arm.control(rate_hz=50, unattended=True) as control:
-                for _ in rig.clock.rate(50):
+        for field in ("q", "dq", "tau_J", "q_d", "dq_d", "tau_ext_hat_filtered", "O_F_ext_hat_K"):
+            for value in ("nan", "inf"):
+                with (
+                    pytest.warns(RuntimeWarning, match="impossible"),
+                    arm.control(rate_hz=10, unattended=True) as control,
+                ):
                     control.send(hal.Twist([0.0, 0.05, 0.0]))
-                    if arm.state().dq_set.any():
-                        break
-                fr3.control.send(f"spoil {field} {value}")
-                rig.clock.sleep(0.05)
-                with pytest.raises(hal.MotionStopped) as caught:
-                    control.send(hal.Twist([0.0, 0.05, 0.0]))
-                assert caught.value.code == "bad_reading", field
-                fr3.control.send(f"spoil {field} off")
-                rig.clock.sleep(0.3)
+                    rig.clock.sleep(0.05)
+                    assert control.trip is hal.Trip.NONE
+                    fr3.control.send(f"spoil {field} {value}")
+                    rig.clock.sleep(0.01)
+                    assert control.trip is hal.Trip.BAD_READING, (field, value)
+                    fr3.control.send(f"spoil {field} off")
     assert not fr3.events("reflex")

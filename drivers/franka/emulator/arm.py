@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from hal.drivers.franka.flags import FLAGS
 from hal.drivers.franka.limits import ELBOW_FLIP, ArmLimits
 
-from .faults import SetpointReports
+from .faults import SetpointReports, Unrest
 from .journal import Counters, Journal
 from .motion import (
     DT,
@@ -78,6 +78,8 @@ class EmulatedArm:
     """Injected fault: the end of a motion is never answered."""
     reports: SetpointReports = field(default_factory=SetpointReports)
     """Injected faults of the reported set-points."""
+    unrest: Unrest = field(default_factory=Unrest)
+    """Injected fault: an arm that does not settle."""
 
     def __post_init__(self) -> None:
         self.checker = LimitChecker(self.limits)
@@ -97,6 +99,8 @@ class EmulatedArm:
         self.shown = self.sample
         """Set-point that the state reports."""
         self._pending: tuple[int, MoveOptions] | None = None
+        self.unrest.set(None)
+        self._writer.spoilt.clear()
 
     def place(self, q: Floats | None) -> None:
         """Put the arm at ``q`` (7,), rad, or at its start position. Raises ValueError while a motion runs."""
@@ -163,7 +167,7 @@ class EmulatedArm:
     def _move(self) -> None:
         motion = self.motion
         if motion is None or not motion.external or motion.waiting:
-            self.plant.follow(self.sample)
+            self.plant.follow(self.unrest.shifted(self.sample))
             return
         self.plant.push(motion.torques)
         if motion.options.generator is Generator.NONE:
@@ -227,6 +231,15 @@ class EmulatedArm:
         """Press or release the emergency stop. That the arm is idle once it is released is an assumption."""
         self.stops.emergency = on
         self._stopped(on, "emergency stop")
+
+    def spoil(self, name: str, value: float | None) -> None:
+        """Report ``value`` as the first number of a field of the state; None for the true one. Raises ValueError."""
+        reals = [known for known, kept in self._writer.packet.layout.fields.items() if kept.kind in "df"]
+        if name not in reals:
+            raise ValueError(f"{name!r} is none of the state's fields of real numbers: {', '.join(reals)}")
+        self._writer.spoilt.pop(name, None)
+        if value is not None:
+            self._writer.spoilt[name] = value
 
     def guiding(self, on: bool) -> None:
         """Start or end guiding by hand. Raises ValueError while a motion runs."""
@@ -328,6 +341,8 @@ class StateWriter:
 
     def __init__(self, version: int) -> None:
         self.packet = StatePacket(version)
+        self.spoilt: dict[str, float] = {}
+        """Injected fault: what is reported in place of the first number of a field."""
         self._settings: object = None
         self._changes = -1
         self._flags: object = None
@@ -337,7 +352,7 @@ class StateWriter:
         self.packet.put("O_ddP_O", (0.0, 0.0, -9.81))
 
     def write(self, arm: EmulatedArm) -> bytearray:
-        """Return the packet after this cycle, always in the same buffer."""
+        """Return the packet after this cycle, always in the same buffer, unless it is spoilt."""
         packet, plant, motion, sample = self.packet, arm.plant, arm.motion, arm.shown
         if arm.settings is not self._settings or arm.settings.changes != self._changes:
             self._write_settings(arm)
@@ -348,9 +363,8 @@ class StateWriter:
         dtau = [(new - old) / DT for new, old in zip(tau, self._tau, strict=True)]
         self._tau = tau
         torques: Floats = motion.torques if motion is not None else (0.0,) * 7
-        measured, speeds = arm.reports.seen(q, plant.dq)
-        packet.put_joints((*tau, *torques, *dtau, *measured, *sample.q, *speeds, *sample.dq, *sample.ddq))
-        packet.put_motors((*measured, *speeds))
+        packet.put_joints((*tau, *torques, *dtau, *q, *sample.q, *plant.dq, *sample.dq, *sample.ddq))
+        packet.put_motors((*q, *plant.dq))
         packet.put_modes(*arm.modes)
         flags = (arm.errors, arm.last_errors)
         if flags != self._flags:
@@ -359,9 +373,7 @@ class StateWriter:
                 packet.put(name, [int(k in raised) for k in range(FLAG_COUNT)])
         packet.put("robot_mode", (arm.mode,))
         packet.put("control_command_success_rate", (motion.success_rate if motion is not None else 0.0,))
-        for name, value in arm.reports.spoiled.items():
-            packet.put(name, (value, *packet.get(name)[1:]))
-        return packet.buffer
+        return packet.spoilt(self.spoilt) if self.spoilt else packet.buffer
 
     def _write_poses(self, arm: EmulatedArm) -> None:
         q, q_d = arm.plant.q, arm.shown.q

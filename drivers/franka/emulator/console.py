@@ -138,9 +138,6 @@ def _readable_stdin() -> int | None:
 
 # Commands.
 
-_EXTERNAL = ("tau_ext_hat_filtered", "O_F_ext_hat_K")
-_SPOILED = ("tau_J", "tau_J_d", "q", "q_d", "dq", "dq_d", *_EXTERNAL)
-"""Fields of the state that may be given impossible values. Those of external forces are else 0."""
 _MAX_DURATION = 600.0
 """Longest duration of a fault, s."""
 _NOTED = frozenset(command.usage.split()[0] for command in COMMANDS if command.noted)
@@ -166,8 +163,8 @@ class Executor:
             "report-lag": self._report_lag,
             "report-noise": self._report_noise,
             "report-measured": self._report_measured,
-            "sag": self._sag,
             "spoil": self._spoil,
+            "unrest": lambda words: server.arm.unrest.set(None if words == ["off"] else int(*_exactly(words, 1))),
             "truncate": self._truncate,
             "reflex": self._reflex,
             "user-stop": lambda words: server.arm.user_stop(_switch(words)),
@@ -221,23 +218,11 @@ class Executor:
     def _report_measured(self, words: Words) -> None:
         self._server.arm.reports.measured = _switch(words)
 
-    def _sag(self, words: Words) -> None:
-        size, shake = (float(word) for word in (*words, "0")[:2])
-        if not (0.0 <= size <= 0.1 and 0.0 <= shake <= 1.0):
-            raise ValueError("takes 0 to 0.1 rad, and 0 to 1 rad/s")
-        self._server.arm.reports.sag(size, shake)
-
     def _spoil(self, words: Words) -> None:
-        name, word = _exactly(words, 2)
-        spoiled = self._server.arm.reports.spoiled
-        if name not in _SPOILED or word not in ("nan", "inf", "off"):
-            raise ValueError(f"takes one of {', '.join(_SPOILED)}, then nan, inf or off")
-        if word != "off":
-            spoiled[name] = float(word)
-        elif name in _EXTERNAL:  # nothing else writes these
-            spoiled[name] = 0.0
-        else:
-            spoiled.pop(name, None)
+        field, value = _exactly(words, 2)
+        if value not in ("nan", "inf", "off"):
+            raise ValueError("takes nan, inf or off")
+        self._server.arm.spoil(field, None if value == "off" else float(value))
 
     def _truncate(self, words: Words) -> None:
         self._server.faults.truncate = _switch(words)

@@ -9,9 +9,12 @@ import random
 from collections import deque
 from typing import NamedTuple
 
-from .motion import Floats, MotionSample
+from .motion import DT, Floats, MotionSample
 
-__all__ = ["COMMANDS", "InjectedFaults", "PacketLoss", "SetpointReports", "help_text"]
+__all__ = ["COMMANDS", "InjectedFaults", "PacketLoss", "SetpointReports", "Unrest", "help_text"]
+
+_SWING = 0.08
+"""Share of its distance from the set-point by which an arm in unrest moves back and forth, a cycle each."""
 
 
 class FaultCommand(NamedTuple):
@@ -31,11 +34,13 @@ COMMANDS = (
     FaultCommand("report-noise S", "add noise to the reported q_d: normal, S rad", noted=True),
     FaultCommand("report-measured on|off", "report measured positions and speeds as q_d and dq_d", noted=True),
     FaultCommand(
-        "sag S [V]",
-        "measure positions S rad away from the true ones, each joint to a random side, and shaking by V rad/s",
+        "spoil FIELD nan|inf|off", "report that as the first number of a field of the state, as `tau_J`", noted=True
+    ),
+    FaultCommand(
+        "unrest SEED|off",
+        "hold the arm 0.1 to 1 mrad off its set-points, chosen at random, swinging by up to 0.08 rad/s",
         noted=True,
     ),
-    FaultCommand("spoil FIELD nan|inf|off", "report that as the first value of a field of the state", noted=True),
     FaultCommand("truncate on|off", "send states that are one byte too short", noted=True),
     FaultCommand("reflex NAME|INDEX", "raise an error flag: a running motion is aborted, and recovery is required"),
     FaultCommand("user-stop on|off", "press or release the user stop"),
@@ -96,7 +101,7 @@ class PacketLoss:
 
 
 class SetpointReports:
-    """How the arm reports its set-points and measurements: correctly, unless a fault is injected."""
+    """How the arm reports its set-points: correctly, unless a fault is injected."""
 
     MAX_LAG = 10
     """Largest delay, cycles."""
@@ -111,23 +116,6 @@ class SetpointReports:
         self.lag = 0
         self.noise = 0.0
         self.measured = False
-        self.spoiled: dict[str, float] = {}
-        """First value of a field of the state, by its name."""
-        self.sag(0.0, 0.0)
-
-    def sag(self, size: float, shake: float) -> None:
-        """Measure each joint ``size`` rad away from where it is, to a random side, and shaking by ``shake`` rad/s."""
-        self._offsets = [self._random.choice((-size, size)) for _ in range(7)]
-        self._shake = shake
-
-    def seen(self, q: Floats, dq: Floats) -> tuple[Floats, Floats]:
-        """Return the measured positions (7,), rad, and speeds (7,), rad/s, that are reported."""
-        if any(self._offsets):
-            q = [x + offset for x, offset in zip(q, self._offsets, strict=True)]
-        if self._shake:
-            self._shake = -self._shake
-            dq = [v + self._shake for v in dq]
-        return q, dq
 
     def shown(self, sample: MotionSample, q: Floats, dq: Floats) -> MotionSample:
         """Return the reported set-point of this cycle.
@@ -145,6 +133,31 @@ class SetpointReports:
         if self.noise:
             sample = sample._replace(q=[x + self._random.gauss(0.0, self.noise) for x in sample.q])
         return sample
+
+
+class Unrest:
+    """Keeps an arm that is held by positions from settling: friction, and errors in the model of its weight."""
+
+    def __init__(self) -> None:
+        self._offsets: Floats = ()
+        self._swing = _SWING
+
+    def set(self, seed: int | None) -> None:
+        """Choose how far each joint is off, 0.1 to 1 mrad to either side; None ends the unrest."""
+        generator = random.Random(seed)
+        signs = () if seed is None else range(7)
+        self._offsets = [generator.choice((-1.0, 1.0)) * generator.uniform(1e-4, 1e-3) for _ in signs]
+
+    def shifted(self, sample: MotionSample) -> MotionSample:
+        """Return where the arm is held in this cycle in place of ``sample``."""
+        if not self._offsets:
+            return sample
+        self._swing = swing = -self._swing
+        return MotionSample(
+            [q + (1.0 + 0.5 * swing) * off for q, off in zip(sample.q, self._offsets, strict=True)],
+            [dq + swing * off / DT for dq, off in zip(sample.dq, self._offsets, strict=True)],
+            sample.ddq,
+        )
 
 
 class InjectedFaults:

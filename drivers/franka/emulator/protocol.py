@@ -11,7 +11,7 @@ protocol 10 in single precision with two blocks of accelerometers; commands are 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import NamedTuple
@@ -347,6 +347,14 @@ class StatePacket:
         """Return the values of one field."""
         span = self._spans[name]
         return span.struct.unpack_from(self.buffer, span.offset)
+
+    def spoilt(self, values: Mapping[str, float]) -> bytearray:
+        """Return a copy in which each of these fields begins with that value."""
+        copy = bytearray(self.buffer)
+        for name, value in values.items():
+            field = self.layout.fields[name]
+            struct.pack_into(f"<{field.kind}", copy, field.offset, value)
+        return copy
 
     def put_joints(self, values: Sequence[float]) -> None:
         """Write tau_J, tau_J_d, dtau_J, q, q_d, dq, dq_d, ddq_d: 56 values."""
