@@ -1,9 +1,9 @@
 """Test tiers, the meaning of a skip, the simulation's engines, and plain specs to make drivers from.
 
-Every test carries the marker of its folder: ``unit``, ``contract``, ``lock_step``, ``wire``, ``system``, ``browser``,
-``apps``, ``docs`` or ``packaging``. The first three are the fast tier, which carries ``fast`` as well, and is what
-``pytest`` runs, in parallel where pytest-xdist is installed. ``pytest -m all`` runs everything, and a file or folder
-named on the command line runs whatever its tier. See ``pytest --markers``.
+Every test carries the marker of its folder: ``unit``, ``contract``, ``lock_step``, ``loops``, ``wire``, ``system``,
+``browser``, ``apps``, ``docs`` or ``packaging``. The first four are the fast tier, which carries ``fast`` as well, and
+is what ``pytest`` runs, in parallel where pytest-xdist is installed. ``pytest -m all`` runs everything, and a file or
+folder named on the command line runs whatever its tier. See ``pytest --markers``.
 """
 
 # ruff: noqa: E402  # numpy reads these variables when it is imported
@@ -35,6 +35,7 @@ FAST = {
     "unit": "one part of the package at a time",
     "contract": "every driver against the contract of its kind (hal.testing)",
     "lock_step": "whole rigs in simulation, in lock-step",
+    "loops": "what a user does, from beginning to end: each row of the tables of docs/safety.md",
 }
 OTHERS = {
     "wire": "drivers against emulated devices, through the vendors' client libraries",
@@ -46,7 +47,7 @@ OTHERS = {
 }
 MARKERS = {
     "all": "every test: 'pytest -m all' runs everything",
-    "fast": "tests of the fast tier (unit, contract and lock_step, without the slow ones): what 'pytest' runs",
+    "fast": "tests of the fast tier (unit, contract, lock_step and loops, without the slow ones): what 'pytest' runs",
     "slow": "takes more than a few seconds; never in the fast tier",
     "alone": "drives in real time what a busy computer would stop: CI runs nothing beside it, as with all of 'browser'",
 }
