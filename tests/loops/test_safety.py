@@ -1,19 +1,17 @@
 """Every row of the tables of docs/safety.md, as a program meets it: through ``hal.open``.
 
 Rows of a mock arm run in lock-step, where times are exact. Rows about a process run in real time, and wait for events.
-A row that a test elsewhere shows through ``hal.open`` or an emulator is in :data:`ELSEWHERE`.
+Other rows are shown elsewhere: ``safety_kit.py`` names the tests.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 import os
-import re
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -27,228 +25,29 @@ from waiting import wait_until
 import hal
 from hal import JointTarget, JointTorque, RobotStatus, Trip
 
+from .safety_kit import PUSHING, STOPS, TICK, Stop, check_rows, shows
+
+pytestmark = pytest.mark.filterwarnings("ignore:panda was stopped")
 ROOT = Path(__file__).parents[2]
-TICK = 1 / 240
-"""Period of the mock arm's servo, s."""
-HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
-
-ELSEWHERE = {
-    "the console's browser freezes": ("tests/browser/test_trips.py", "tests/browser/test_pages.py"),
-    "another arm of the same `hal-teleop`": (
-        "tests/unit/core/test_session_arms.py::test_a_trip_of_one_arm_holds_the_other_until_a_new_press_of_its_own",
-        "tests/unit/core/test_session_arms.py::test_independent_arms_do_not_stop_each_other",
-    ),
-    "your loop is too slow or hangs": ("tests/system/test_ends.py::test_user_code_that_goes_wrong",),
-    "the app is killed": ("tests/system/test_ends.py::test_an_app_that_ends",),
-    "the host's process dies": ("tests/system/test_real_time.py::test_a_host_that_is_killed_is_told_by_the_next_call",),
-    "a Franka ends the motion": ("tests/wire/test_franka_faults.py", "tests/wire/test_franka_stops.py"),
-    "a Franka's set-points or states": ("tests/wire/test_franka_tour.py::test_packets_that_are_lost_end_no_motion",),
-    "the app of a Franka is killed": ("tests/wire/test_franka_ends.py::test_an_app_is_killed_while_the_robot_hangs",),
-    "the host of an arm with Damiao motors dies": (
-        "tests/wire/test_can_gravity.py::test_an_arm_without_its_program_sinks_slowly",
-    ),
-    "an arm with Damiao motors is closed": (
-        "tests/lock_step/test_can_faults.py::test_close_lowers_a_raised_arm_slowly_and_never_drops_it",
-        "tests/lock_step/test_can_faults.py::test_a_gripper_holds_while_its_arm_sinks",
-    ),
-    "the host of a PiPER dies": (
-        "tests/wire/test_piper_rig.py::test_an_arm_whose_program_ends_holds",
-        "tests/wire/test_piper_rig.py::test_a_bus_that_is_cut_stops_the_program_and_comes_back",
-    ),
-    "a motor or joint on a CAN bus": ("tests/lock_step/test_can_faults.py::test_a_fault_in_motion",),
-    "the process of a gripper dies": (
-        "tests/system/test_gripper_process.py::test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead",
-    ),
-}
-"""Beginning of a row -> the tests that show it."""
-SHOWN = set(ELSEWHERE)
-"""Beginnings of all rows that have a test."""
-
-
-def shows(*rows: str) -> Callable[[Any], Any]:
-    """Note which rows a test shows, by how they begin."""
-    SHOWN.update(rows)
-    return lambda test: test
-
-
-def rows_of_the_page() -> list[str]:
-    """Return the first cell of each row of the three tables."""
-    text = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
-    cells = []
-    for heading in ("The numbers", "Trips and how to continue", "Events and their effects"):
-        section = text.split(f"## {heading}\n")[1].split("\n## ")[0]
-        cells += [line.strip("| ").split(" |")[0] for line in re.findall(r"^\|.*\|$", section, re.MULTILINE)[2:]]
-    return cells
 
 
 def test_every_row_has_a_test_and_every_test_a_row() -> None:
-    rows = rows_of_the_page()
-    assert len(rows) > 50
-    found = {row: [begin for begin in SHOWN if row.startswith(begin)] for row in rows}
-    assert [row for row, begins in found.items() if len(begins) != 1] == []
-    assert SHOWN - {begins[0] for begins in found.values()} == set()
-    for place in itertools.chain(*ELSEWHERE.values()):
-        file, _, name = place.partition("::")
-        assert f"def {name}" in (ROOT / file).read_text(encoding="utf-8"), place
+    check_rows()
 
 
 # Trips.
 
 
-@dataclass(frozen=True)
-class Stop:
-    """A cause of a trip: what happens, what the program gets, when the arm brakes, and what ends the cause."""
-
-    name: str
-    row: str
-    trip: Trip
-    begin: Callable[[Loop], object]
-    end: Callable[[Loop], object] | None = None
-    """None where the cause is over by itself."""
-    after: float = 0.0
-    """From the event to the stop, at most, s; at least 15 ms less."""
-    deadman: bool | None = None
-    """Whether it needs a session with a dead-man; None for both kinds."""
-    command: hal.Command = TURN
-    rig: tuple[tuple[str, Any], ...] = ()
-
-    def start(self, deadman: bool) -> Any:
-        """Return a program in motion."""
-        return driving(deadman=deadman, command=self.command, **dict(self.rig))
+def cases(stops: Any) -> list[Any]:
+    """Return each cause with and without a dead-man, where it has both."""
+    return [
+        pytest.param(stop, deadman, id=f"{stop.name}, {'dead-man' if deadman else 'no dead-man'}")
+        for stop in stops
+        for deadman in ((False, True) if stop.deadman is None else (stop.deadman,))
+    ]
 
 
-def inject(**faults: Any) -> Callable[[Loop], object]:
-    return lambda loop: loop.arm.inject(**faults)
-
-
-def inject_pad(**faults: Any) -> Callable[[Loop], object]:
-    return lambda loop: loop.pad.inject(**faults)
-
-
-def report(**fields: Any) -> Callable[[Loop], object]:
-    """Return a function that lets the arm report these instead of its own."""
-    return lambda loop: loop.alter(lambda reading: reading._replace(**fields))
-
-
-def report_noise(size: float) -> Callable[[Loop], object]:
-    """Return a function that lets the reported set-points vary by up to ``size``, rad."""
-    signs = itertools.cycle([1.0, -1.0, 0.6, -0.8, 0.9])
-    return lambda loop: loop.alter(
-        lambda reading: reading._replace(q_commanded=[x + size * next(signs) for x in reading.q_commanded or ()])
-    )
-
-
-def recover(loop: Loop) -> None:
-    loop.restore()
-    loop.arm.recover()
-    loop.wait(0.05)
-
-
-def push(torque: float) -> Callable[[Loop], object]:
-    """Return a function that adds a torque to those that drive the first joint."""
-
-    def begin(loop: Loop) -> None:
-        driven = type(loop.device)._driven.__get__(loop.device)
-        loop.device._driven = lambda tau, dt: driven([tau[0] + torque, *tau[1:]], dt)  # type: ignore[method-assign]
-
-    return begin
-
-
-def let_go(loop: Loop) -> None:
-    loop.device.__dict__.pop("_driven", None)
-
-
-def turn_back(loop: Loop) -> None:
-    loop.command = JointTorque([-5.0] + [0.0] * 6)
-
-
-NAN, INF = math.nan, math.inf
-PUSHING = JointTorque([3.0] + [0.0] * 6)
-BAD_VALUES = {
-    "not finite: nan": inject(garbage="nan"),
-    "not finite: inf": inject(garbage="inf"),
-    "too few": inject(garbage="short"),
-    "beyond the range": report(q=(2.8973 + 1.01, *HOME[1:])),
-    "too fast": report(dq=(1001.0, *[0.0] * 6)),
-    # Every field that a reading has, not only those that the servo needs.
-    **{
-        f"{field}: {value}": report(**{field: (value, *[0.0] * (5 if field == "wrench_ext" else 6))})
-        for field in ("dq", "q_commanded", "dq_commanded", "tau", "tau_ext", "wrench_ext")
-        for value in (NAN, INF)
-    },
-}
-
-
-def end_bad_values(loop: Loop) -> None:
-    loop.arm.inject(garbage=None)
-    loop.restore()
-
-
-STOPS = (
-    Stop("no command", "`COMMAND_LATE`", Trip.COMMAND_LATE, lambda loop: loop.wait(0.3), after=0.08 + TICK),
-    Stop(
-        "a frozen pad",
-        "`DEADMAN_SILENT`",
-        Trip.DEADMAN_SILENT,
-        inject_pad(freeze=True),
-        inject_pad(freeze=False),
-        after=0.12,
-        deadman=True,
-    ),
-    Stop(
-        "an unplugged pad",
-        "`DEADMAN_LOST`",
-        Trip.DEADMAN_LOST,
-        inject_pad(disconnect=True),
-        inject_pad(disconnect=False),
-        after=0.015,
-        deadman=True,
-    ),
-    Stop("rig.stop()", "`STOP`", Trip.STOP, lambda loop: loop.rig.stop(), after=TICK),
-    Stop("a fault of the arm", "`FAULT`", Trip.FAULT, inject(fault="collision"), recover, after=TICK),
-    Stop("SETPOINT_MISMATCH", "`FAULT`", Trip.FAULT, report_noise(0.01), recover, after=22 * TICK),
-    Stop(
-        "an arm that does not answer",
-        "`DEVICE_LOST`",
-        Trip.DEVICE_LOST,
-        inject(disconnect=True),
-        inject(disconnect=False),
-        after=TICK,
-    ),
-    Stop(
-        "an arm that repeats a reading",
-        "`DEVICE_LOST`",
-        Trip.DEVICE_LOST,
-        inject(freeze=True),
-        inject(freeze=False),
-        after=0.15,
-    ),
-    *(
-        Stop(name, "`BAD_READING`", Trip.BAD_READING, begin, end_bad_values, TICK, None if name == "too few" else False)
-        for name, begin in BAD_VALUES.items()
-    ),
-    Stop("pushed too fast", "`LIMIT`", Trip.LIMIT, push(30.0), let_go, after=2 * TICK, command=PUSHING),
-    Stop(
-        "at the end of a joint",
-        "`LIMIT`",
-        Trip.LIMIT,
-        lambda loop: None,
-        turn_back,
-        after=1.0,
-        command=PUSHING,
-        rig=(("robots__panda__initial", [2.3, *HOME[1:]]),),
-    ),
-)
-SHOWN.update(stop.row for stop in STOPS)
-CASES = [
-    pytest.param(stop, deadman, id=f"{stop.name}, {'dead-man' if deadman else 'no dead-man'}")
-    for stop in STOPS
-    for deadman in ((False, True) if stop.deadman is None else (stop.deadman,))
-]
-
-
-FIRST = {case.values[0].row: case.values[0] for case in reversed(CASES)}
-ONE_OF_EACH = [case for case in CASES if case.values[0] is FIRST[case.values[0].row]]
+ONE_EACH = cases({stop.trip: stop for stop in reversed(STOPS) if stop.name != "SETPOINT_MISMATCH"}.values())
 """One cause of each trip."""
 
 
@@ -256,8 +55,7 @@ def found_code(error: hal.HalError | None) -> str | None:
     return None if error is None else error.code
 
 
-@pytest.mark.parametrize(("stop", "deadman"), CASES)
-@pytest.mark.filterwarnings("ignore:panda was stopped")
+@pytest.mark.parametrize(("stop", "deadman"), cases(STOPS))
 def test_a_trip_stops_the_arm_until_its_cause_is_gone_and_it_is_acknowledged(stop: Stop, deadman: bool) -> None:
     with stop.start(deadman) as loop:
         began = loop.now
@@ -269,7 +67,7 @@ def test_a_trip_stops_the_arm_until_its_cause_is_gone_and_it_is_acknowledged(sto
         loop.rest()
         loop.assert_stays()
         if stop.end is not None:
-            if stop.row != "`LIMIT`":  # whose cause is gone at rest
+            if stop.trip is not Trip.LIMIT:  # whose cause is gone at rest
                 loop.acknowledge()
                 loop.assert_stays()
             stop.end(loop)
@@ -279,8 +77,7 @@ def test_a_trip_stops_the_arm_until_its_cause_is_gone_and_it_is_acknowledged(sto
         loop.assert_continues()
 
 
-@pytest.mark.parametrize(("stop", "deadman"), ONE_OF_EACH)
-@pytest.mark.filterwarnings("ignore:panda was stopped")
+@pytest.mark.parametrize(("stop", "deadman"), ONE_EACH)
 def test_a_stop_replaces_every_trip_but_a_fault(stop: Stop, deadman: bool) -> None:
     # New: a stop is visible behind any trip, and only who saw it clears it.
     with stop.start(deadman) as loop:
@@ -305,49 +102,36 @@ def test_a_stop_replaces_every_trip_but_a_fault(stop: Stop, deadman: bool) -> No
         loop.assert_continues()
 
 
+RELEASE = Stop("a released dead-man", Trip.NONE, lambda loop: loop.pad.release("l2"), deadman=True)
 FINGERS_REST = 0.150
 """Longest time in which fingers come to rest after the session may not move, s."""
 
 
-def close_released(loop: Loop) -> None:
-    loop.pad.release("l2")
-
-
 @pytest.mark.parametrize("held", [False, True], ids=["nothing", "an object"])
-@pytest.mark.parametrize(
-    ("begin", "deadman"),
-    [
-        *(pytest.param(stop.begin, deadman, id=case.id) for case in ONE_OF_EACH for stop, deadman in [case.values]),
-        pytest.param(close_released, True, id="released dead-man"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:panda was stopped")
-def test_fingers_that_a_session_moves_stop_with_it_and_keep_an_object(
-    begin: Callable[[Loop], object], deadman: bool, held: bool
+@pytest.mark.parametrize(("stop", "deadman"), [*ONE_EACH, *cases([RELEASE])])
+def test_fingers_that_a_session_closes_stop_with_the_arm_and_keep_an_object(
+    stop: Stop, deadman: bool, held: bool
 ) -> None:
-    # New: fingers that a session moves are under the same watch as its arm.
-    with driving(deadman=deadman, robots__panda__gripper__speed=0.02) as loop:
+    # New: what a session moves with the gripper is under the same watch as its arm.
+    with stop.start(deadman, robots__panda__gripper__speed=0.02) as loop:
         gripper = loop.arm.gripper
         assert gripper is not None
+        gripper.inject(object_width=0.07 if held else None)
         loop.grip = 1.0
-        if held:
-            gripper.inject(object_width=0.07)
         assert loop.drive(1.0) is None
-        before = gripper.state()
+        before, began = gripper.state(), loop.now
         assert before.grasped if held else before.moving
-        began = loop.now
-        begin(loop)
+        stop.begin(loop)
         loop.drive(1.0)
         assert not loop.moves
-        since = max(began, loop.servo.t_stop)
-        loop.grip = None
         loop.wait(1.0)
         after = gripper.state()
         if held:
             assert after.grasped
             assert after.width == before.width
         else:
-            assert before.width - after.width <= 0.02 * (since - began + FINGERS_REST + 2 * TICK)
+            stopped = max(began, loop.servo.t_stop) - began
+            assert before.width - after.width <= 0.02 * (stopped + FINGERS_REST + 2 * TICK)
 
 
 # Trips of the process.
@@ -357,7 +141,6 @@ def test_fingers_that_a_session_moves_stop_with_it_and_keep_an_object(
 @pytest.mark.parametrize("how", ["stopped", "suspended"])
 @pytest.mark.slow
 @pytest.mark.alone
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_a_servo_that_could_not_run_trips(how: str) -> None:
     with laboratory() as rig, rig.robots["panda"].control(unattended=True, rate_hz=9) as control:
         loop = Loop(rig, control, TURN)
@@ -459,7 +242,6 @@ def test_a_released_dead_man_stops_the_arm_and_a_press_continues_with_new_comman
 
 @shows("the pad is unplugged, or freezes")
 @pytest.mark.parametrize("fault", ["freeze", "disconnect"])
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_a_pad_that_comes_back_counts_once_its_sticks_are_at_rest(fault: str) -> None:
     with driving(deadman=True) as loop:
         loop.pad.inject(**{fault: True})
@@ -566,7 +348,6 @@ def test_an_exception_continues_once_the_arm_rests(error: type[BaseException]) -
 
 
 @shows("the robot does not answer")
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_an_arm_that_is_lost_is_braked_for_when_it_answers_again() -> None:
     with driving() as loop:
         at = np.array(loop.servo.q_set)
@@ -586,7 +367,6 @@ def test_an_arm_that_is_lost_is_braked_for_when_it_answers_again() -> None:
 
 
 @shows("a session ends, or trips, with an object")
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_fingers_keep_an_object_after_the_session() -> None:
     with driving() as loop:
         gripper = loop.arm.gripper
@@ -609,7 +389,6 @@ def test_fingers_keep_an_object_after_the_session() -> None:
 
 @shows("from the last sign of life of the dead-man's pad", "a sign of life of a pad is too old")
 @pytest.mark.parametrize(("who", "most"), [("pad", 0.120), ("arm", 0.150)])
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_silence_is_a_stop_within(who: str, most: float) -> None:
     """The app's silence is that of a process: see the row of the app that is stopped."""
     with driving(deadman=True) as loop:
@@ -632,7 +411,6 @@ def test_the_app_shows_that_it_is_alive() -> None:
 
 @shows("the next command must come within 2.5 periods")
 @pytest.mark.parametrize(("rate_hz", "deadline"), [(50.0, 0.1), (1000.0, 0.1), (10.0, 0.25), (2.5, 1.0)])
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_commands_have_a_deadline(rate_hz: float, deadline: float) -> None:
     with driving(rate_hz=rate_hz) as loop:
         loop.control.send(TURN)
@@ -668,7 +446,6 @@ def fastest(loop: Loop) -> float:
 
 
 @shows("share of the joint speed limits in a control session")
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_a_session_is_slower_than_the_joints() -> None:
     with driving(command=hal.JointVelocity([9.0, 0, 0, 0, 0, 0, 9.0]), robots__panda__tcp_speed=1.5) as loop:
         assert fastest(loop) == pytest.approx(0.3, rel=1e-4)
@@ -723,7 +500,6 @@ def first_commands(arm: hal.Robot, now: float, angle: float, distance: float) ->
 @shows("distance of a first joint target", "the same for a first pose")
 @pytest.mark.parametrize("kind", ["target", "chunk", "pose"])
 @pytest.mark.parametrize("near", [True, False])
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_a_first_target_is_near(kind: str, near: bool) -> None:
     with mock_rig() as rig, rig.robots["panda"].control() as control:
         share = 0.99 if near else 1.01
@@ -741,11 +517,10 @@ def test_a_first_target_is_near(kind: str, near: bool) -> None:
 
 def torques(loop: Loop) -> list[float]:
     """Return the torques of the first joint that were written, Nm; NaN where positions were."""
-    return [NAN if setpoint.tau is None else setpoint.tau[0] for setpoint in loop.log]
+    return [nan if setpoint.tau is None else setpoint.tau[0] for setpoint in loop.log]
 
 
 @shows("torques: each changes by at most")
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_torques_change_at_a_rate() -> None:
     with driving(command=JointTorque([30.0] + [0.0] * 6)) as loop:
         steps = np.abs(np.diff(torques(loop))) / TICK
@@ -753,7 +528,6 @@ def test_torques_change_at_a_rate() -> None:
 
 
 @shows("torques are kept without a reading")
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_torques_are_removed_when_readings_stop() -> None:
     with driving(command=PUSHING) as loop:
         written = len(loop.log)
@@ -769,15 +543,12 @@ def test_torques_are_removed_when_readings_stop() -> None:
 
 
 @shows("torques brake for at most")
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_positions_take_over_an_arm_that_torques_do_not_brake() -> None:
     with driving(command=PUSHING) as loop:
-        driven = type(loop.device)._driven.__get__(loop.device)
-        still = 0.3  # rad/s, whatever the torques
-        loop.device._follows = loop.device._follows._replace(dq=(still, *[0.0] * 6))
+        speed = (0.3, *[0.0] * 6)  # rad/s, whatever the torques
+        driven = loop.device._driven
         loop.device._driven = lambda tau, dt: driven(tau, dt)._replace(  # type: ignore[method-assign]
-            q=[x + dt * v for x, v in zip(loop.device._follows.q, (still, *[0.0] * 6), strict=True)],
-            dq=(still, *[0.0] * 6),
+            q=[x + dt * v for x, v in zip(loop.device._follows.q, speed, strict=True)], dq=speed
         )
         loop.rig.stop()
         written = len(loop.log)
@@ -837,7 +608,6 @@ def test_reports_that_fit_no_set_point_are_a_fault(change: Callable[[list[Any], 
 
 
 @shows("bringing the arms to rest")
-@pytest.mark.filterwarnings("ignore:panda was stopped")
 def test_devices_are_closed_although_an_arm_does_not_come_to_rest() -> None:
     with mock_rig(robots__panda__limits={"acceleration": 0.02}) as rig:
         control = rig.robots["panda"].control()
