@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import itertools
 import re
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf, nan
 from pathlib import Path
 from typing import Any
 
-from loop_kit import TURN, Loop, driving
+import numpy as np
+from loop_kit import TURN, Loop, driving, mock_rig
 
 import hal
 from hal import JointTorque, Trip
 
-__all__ = ["PUSHING", "STOPS", "TICK", "Stop", "check_rows", "push", "shows"]
+__all__ = ["PUSHING", "STOPS", "TICK", "Stop", "check_rows", "code_of", "late", "noisy", "reported", "shows", "wrong"]
 
 ROOT = Path(__file__).parents[2]
 TICK = 1 / 240
@@ -96,6 +98,13 @@ class Stop:
         return driving(deadman=deadman, command=self.command, **self.rig, **more)
 
 
+def stop_from_a_thread(loop: Loop) -> None:
+    """Stop the rig in another thread."""
+    thread = threading.Thread(target=loop.rig.stop)
+    thread.start()
+    thread.join()
+
+
 def inject(device: str = "arm", **faults: Any) -> Callable[[Loop], object]:
     """Return a function that injects faults into the arm, or the ``pad``."""
     return lambda loop: getattr(loop, device).inject(**faults)
@@ -163,7 +172,7 @@ STOPS = (
     Stop("no command", Trip.COMMAND_LATE, lambda loop: loop.wait(0.3), None, 0.08 + TICK),
     Stop("a frozen pad", Trip.DEADMAN_SILENT, inject("pad", freeze=True), inject("pad", freeze=False), 0.12, True),
     Stop("no pad", Trip.DEADMAN_LOST, inject("pad", disconnect=True), inject("pad", disconnect=False), 0.015, True),
-    Stop("rig.stop()", Trip.STOP, lambda loop: loop.rig.stop()),
+    Stop("rig.stop()", Trip.STOP, stop_from_a_thread),
     Stop("a fault of the arm", Trip.FAULT, inject(fault="collision"), recover),
     Stop("SETPOINT_MISMATCH", Trip.FAULT, report_nonsense, recover, 22 * TICK),
     Stop("no answer", Trip.DEVICE_LOST, inject(disconnect=True), inject(disconnect=False)),
@@ -184,3 +193,42 @@ STOPS = (
     ),
 )
 SHOWN.update(f"`{stop.trip.name}`" for stop in STOPS)
+
+
+# Reports of set-points.
+
+
+def code_of(error: hal.HalError | None) -> str | None:
+    """Return the code of an error, or None."""
+    return None if error is None else error.code
+
+
+def reported(change: Callable[[list[Any], int], Any]) -> str | None:
+    """Return the code that ends 1.5 s of driving; ``change`` makes each report of the set-points so far."""
+    with mock_rig() as rig:
+        loop = Loop(rig, rig.robots["panda"].control(), TURN)
+        given: list[Any] = []
+
+        def changed(reading: Any) -> Any:
+            given.append(reading.q_commanded)
+            return reading._replace(q_commanded=change(given, len(given)))
+
+        loop.alter(changed)
+        with loop.control:
+            return code_of(loop.drive(1.5))
+
+
+def wrong(count: int) -> Callable[[list[Any], int], Any]:
+    """Report ``count`` set-points that were not given, after 200 that were."""
+    return lambda given, n: [x + 0.01 * (1 + n % 3) for x in given[-1]] if 200 <= n < 200 + count else given[-1]
+
+
+def noisy(size: float) -> Callable[[list[Any], int], Any]:
+    """Report the set-points with noise, rad."""
+    random = np.random.default_rng(1)
+    return lambda given, n: given[-1] + size * random.choice([-1.0, 1.0], 7)
+
+
+def late(cycles: int) -> Callable[[list[Any], int], Any]:
+    """Report the set-points so many cycles late."""
+    return lambda given, n: given[max(0, n - 1 - cycles)]

@@ -25,10 +25,15 @@ from waiting import wait_until
 import hal
 from hal import JointTarget, JointTorque, RobotStatus, Trip
 
-from .safety_kit import PUSHING, STOPS, TICK, Stop, check_rows, shows
+from .safety_kit import PUSHING, STOPS, TICK, Stop, check_rows, code_of, late, noisy, reported, shows, wrong
 
 pytestmark = pytest.mark.filterwarnings("ignore:panda was stopped")
 ROOT = Path(__file__).parents[2]
+
+
+def in_real_time(test: Any) -> Any:
+    """Mark a test of what a busy computer would stop."""
+    return pytest.mark.slow(pytest.mark.alone(test))
 
 
 def test_every_row_has_a_test_and_every_test_a_row() -> None:
@@ -51,16 +56,12 @@ ONE_EACH = cases({stop.trip: stop for stop in reversed(STOPS) if stop.name != "S
 """One cause of each trip."""
 
 
-def found_code(error: hal.HalError | None) -> str | None:
-    return None if error is None else error.code
-
-
 @pytest.mark.parametrize(("stop", "deadman"), cases(STOPS))
 def test_a_trip_stops_the_arm_until_its_cause_is_gone_and_it_is_acknowledged(stop: Stop, deadman: bool) -> None:
     with stop.start(deadman) as loop:
         began = loop.now
         stop.begin(loop)
-        assert found_code(loop.drive(1.5)) == stop.trip.code
+        assert code_of(loop.drive(1.5)) == stop.trip.code
         assert loop.control.trip is stop.trip
         if stop.name != "at the end of a joint":
             assert stop.after - 0.015 <= loop.servo.t_stop - began <= stop.after + 1e-6
@@ -82,7 +83,7 @@ def test_a_stop_replaces_every_trip_but_a_fault(stop: Stop, deadman: bool) -> No
     # New: a stop is visible behind any trip, and only who saw it clears it.
     with stop.start(deadman) as loop:
         stop.begin(loop)
-        assert found_code(loop.drive(1.5)) == stop.trip.code
+        assert code_of(loop.drive(1.5)) == stop.trip.code
         loop.rig.stop()
         if not deadman:
             loop.control.rearm()  # for the trip that the program has seen
@@ -93,11 +94,11 @@ def test_a_stop_replaces_every_trip_but_a_fault(stop: Stop, deadman: bool) -> No
             stop.end(loop)
         loop.wait(0.2)
         if stop.trip is not Trip.FAULT:
-            assert found_code(loop.drive()) == Trip.STOP.code
+            assert code_of(loop.drive()) == Trip.STOP.code
         loop.assert_stays()
         loop.acknowledge()
         if stop.trip is Trip.FAULT and loop.control.trip:
-            assert found_code(loop.drive()) == Trip.STOP.code
+            assert code_of(loop.drive()) == Trip.STOP.code
             loop.acknowledge()
         loop.assert_continues()
 
@@ -139,8 +140,7 @@ def test_fingers_that_a_session_closes_stop_with_the_arm_and_keep_an_object(
 
 @shows("`HOST_LATE`")
 @pytest.mark.parametrize("how", ["stopped", "suspended"])
-@pytest.mark.slow
-@pytest.mark.alone
+@in_real_time
 def test_a_servo_that_could_not_run_trips(how: str) -> None:
     with laboratory() as rig, rig.robots["panda"].control(unattended=True, rate_hz=9) as control:
         loop = Loop(rig, control, TURN)
@@ -172,8 +172,7 @@ REARMING = """
 
 
 @shows("`APP_SILENT`", "the app is stopped")
-@pytest.mark.slow
-@pytest.mark.alone
+@in_real_time
 def test_an_app_that_is_stopped_continues_when_it_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     send = "        control.send(hal.JointVelocity(velocity))\n"
     assert send in observer.APP
@@ -197,8 +196,7 @@ def test_an_app_that_is_stopped_continues_when_it_comes_back(tmp_path: Path, mon
 
 
 @shows("after the last sign of life of an app that still exists")
-@pytest.mark.slow
-@pytest.mark.alone
+@in_real_time
 def test_the_host_of_an_app_that_stays_silent_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     with laboratory() as rig:
         host: Any = rig._hosts[0]
@@ -213,8 +211,7 @@ def test_the_host_of_an_app_that_stays_silent_ends(monkeypatch: pytest.MonkeyPat
 
 
 @shows("a vendor's library that does not return")
-@pytest.mark.slow
-@pytest.mark.alone
+@in_real_time
 def test_a_library_that_does_not_return_is_ended_with_its_process() -> None:
     with laboratory("PACING_ARM") as rig:
         rig.robots["panda"].inject(shorten={"hal.host.main:HANG": 1}, hang=True)
@@ -259,12 +256,18 @@ def test_a_pad_that_comes_back_counts_once_its_sticks_are_at_rest(fault: str) ->
         loop.assert_continues()
 
 
-def test_what_is_held_when_the_session_opens_moves_nothing() -> None:
+@pytest.mark.parametrize("taped", [False, True])
+def test_what_is_held_when_the_session_opens_moves_nothing(taped: bool) -> None:
     with mock_rig() as rig:
+        if taped:  # before the pad was seen with it released
+            rig.driver("pad").inject(disconnect=True)
+        switch = rig.gamepads["pad"].hold("l2")
         rig.clock.sleep(0.1)
         rig.driver("pad").press("l2")
+        rig.driver("pad").clear()
         rig.clock.sleep(0.1)
-        with rig.robots["panda"].control(deadman=rig.gamepads["pad"].hold("l2")) as control:
+        assert switch.held is not taped
+        with rig.robots["panda"].control(deadman=switch) as control:
             loop = Loop(rig, control, TURN)
             loop.assert_stays()
             loop.acknowledge()
@@ -345,6 +348,8 @@ def test_an_exception_continues_once_the_arm_rests(error: type[BaseException]) -
             raise error
         assert not loop.moves
         assert arm.state().status is RobotStatus.IDLE
+        with raises_code(hal.CommandError, "session_closed"):
+            control.send(TURN)
 
 
 @shows("the robot does not answer")
@@ -356,7 +361,7 @@ def test_an_arm_that_is_lost_is_braked_for_when_it_answers_again() -> None:
         with pytest.raises(hal.ConnectionLost):
             loop.arm.state()
         assert loop.moves, "the set-point brakes"
-        assert found_code(loop.drive()) == "device_lost"
+        assert code_of(loop.drive()) == "device_lost"
         loop.rest()
         assert 0.0 < loop.servo.q_set[0] - at[0] < 0.05
         loop.arm.inject(disconnect=False)
@@ -400,8 +405,7 @@ def test_silence_is_a_stop_within(who: str, most: float) -> None:
 
 
 @shows("period of the app's sign of life")
-@pytest.mark.slow
-@pytest.mark.alone
+@in_real_time
 def test_the_app_shows_that_it_is_alive() -> None:
     with laboratory() as rig:
         memory, signs = rig._hosts[0].memory, set()
@@ -533,7 +537,7 @@ def test_torques_are_removed_when_readings_stop() -> None:
         written = len(loop.log)
         loop.arm.inject(freeze=True)
         began = loop.now
-        assert found_code(loop.drive()) == "device_lost"
+        assert code_of(loop.drive()) == "device_lost"
         assert 0.020 < loop.servo.t_stop - began <= 0.020 + TICK
         loop.wait(0.5)
         later = torques(loop)[written + 6 :]
@@ -559,38 +563,6 @@ def test_positions_take_over_an_arm_that_torques_do_not_brake() -> None:
         assert not braked[-1]
 
 
-def reported(change: Callable[[list[Any], int], Any]) -> str | None:
-    """Return the code that ends 1.5 s of driving; ``change`` makes each report of the set-points so far."""
-    with mock_rig() as rig:
-        loop = Loop(rig, rig.robots["panda"].control(), TURN)
-        given: list[Any] = []
-
-        def changed(reading: Any) -> Any:
-            given.append(reading.q_commanded)
-            return reading._replace(q_commanded=change(given, len(given)))
-
-        loop.alter(changed)
-        with loop.control:
-            return found_code(loop.drive(1.5))
-
-
-def shifted(q: Any, by: float) -> list[float]:
-    return [x + by for x in q]
-
-
-def wrong(count: int) -> Callable[[list[Any], int], Any]:
-    return lambda given, n: shifted(given[-1], 0.01 * (1.0 + n % 3)) if 200 <= n < 200 + count else given[-1]
-
-
-def noisy(size: float) -> Callable[[list[Any], int], Any]:
-    random = np.random.default_rng(1)
-    return lambda given, n: given[-1] + size * random.choice([-1.0, 1.0], 7)
-
-
-def late(cycles: int) -> Callable[[list[Any], int], Any]:
-    return lambda given, n: given[max(0, n - 1 - cycles)]
-
-
 @shows("reports of set-points may be late", "and differ from the set-points", "of 100 reports, this many")
 @pytest.mark.parametrize(
     ("change", "code"),
@@ -609,11 +581,11 @@ def test_reports_that_fit_no_set_point_are_a_fault(change: Callable[[list[Any], 
 
 @shows("bringing the arms to rest")
 def test_devices_are_closed_although_an_arm_does_not_come_to_rest() -> None:
-    with mock_rig(robots__panda__limits={"acceleration": 0.02}) as rig:
+    with mock_rig(robots__panda__limits={"acceleration": 0.01}) as rig:
         control = rig.robots["panda"].control()
         control.__enter__()
         loop = Loop(rig, control, TURN)
-        assert loop.drive(10.0) is None
+        assert loop.drive(20.0) is None
         with pytest.raises(hal.ConnectionLost):  # the session waits as long
             control.close()
         assert loop.moves

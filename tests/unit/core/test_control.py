@@ -1,7 +1,6 @@
 """Control sessions through the public interface, on the built-in rig with mock devices in lock-step."""
 
 import itertools
-import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,7 +18,6 @@ from hal import (
     JointVelocity,
     MotionStopped,
     NotSupported,
-    RobotFault,
     RobotStatus,
     Trip,
     Twist,
@@ -189,98 +187,6 @@ def test_a_loop_in_which_no_time_passes_is_an_error(rig: hal.Rig, arm: hal.Robot
 # Stops
 
 
-def test_commands_that_stop_coming_trip_until_a_rearm(rig: hal.Rig, arm: hal.Robot) -> None:
-    with arm.control(rate_hz=50) as control:
-        drive(rig, control)
-        assert arm.state().dq_set[0] == pytest.approx(0.2)
-        rig.clock.sleep(0.5)
-        assert control.trip is Trip.COMMAND_LATE
-        assert np.abs(arm.state().dq_set).max() == 0.0
-        with raises_code(MotionStopped, "command_deadline"):
-            control.send(TURN)
-        stopped = arm.state().q
-        control.rearm()
-        drive(rig, control)
-        assert arm.state().q[0] > stopped[0] + 0.01
-
-
-def test_stop_from_another_thread_is_latched_also_for_the_next_session(rig: hal.Rig, arm: hal.Robot) -> None:
-    with raises_code(MotionStopped, "rig_stop"), arm.control() as control:
-        drive(rig, control)
-        thread = threading.Thread(target=rig.stop)
-        thread.start()
-        thread.join()
-        drive(rig, control)
-    with raises_code(MotionStopped, "rig_stop"):
-        arm.move_to(arm.home)
-    rig.rearm()
-    arm.move_to(arm.home)
-    assert arm.state().q == pytest.approx(arm.home, abs=1e-6)
-
-
-def test_the_deadman_starts_stops_and_starts_again(rig: hal.Rig, arm: hal.Robot) -> None:
-    rig.clock.sleep(0.1)
-    with arm.control(deadman=rig.gamepads["pad"].hold("l2")) as control:
-        assert all(sent.reasons for sent in drive(rig, control, count=10))
-        assert np.array_equal(arm.state().q, arm.home), "nothing moves before it is pressed"
-        press(rig)
-        drive(rig, control)
-        assert arm.state().dq_set[0] == pytest.approx(0.2)
-        release(rig)
-        drive(rig, control)
-        assert control.status is RobotStatus.HOLDING
-        held = arm.state().q
-        drive(rig, control, count=5)
-        assert np.array_equal(arm.state().q, held)
-        press(rig)
-        drive(rig, control)
-        assert arm.state().q[0] > held[0] + 0.01
-
-
-@pytest.mark.parametrize(("fault", "trip"), [("freeze", Trip.DEADMAN_SILENT), ("disconnect", Trip.DEADMAN_LOST)])
-def test_a_pad_that_freezes_or_goes_stops_the_arm_until_it_is_pressed_again(
-    rig: hal.Rig, arm: hal.Robot, fault: str, trip: Trip
-) -> None:
-    driver = rig.driver("pad")
-    rig.clock.sleep(0.1)
-    with arm.control(deadman=rig.gamepads["pad"].hold("l2")) as control:
-        press(rig)
-        drive(rig, control)
-        assert arm.state().dq_set[0] == pytest.approx(0.2)
-        driver.inject(**{fault: True})
-        with raises_code(MotionStopped, trip.code):
-            drive(rig, control, count=50)
-        rig.clock.sleep(0.3)
-        assert control.trip is trip
-        assert np.abs(arm.state().dq_set).max() == 0.0
-        stopped = arm.state().q
-        driver.inject(**{fault: False})
-        rig.clock.sleep(0.3)
-        with pytest.raises(MotionStopped):  # the dead-man is still held, from before
-            control.send(TURN)
-        release(rig)
-        press(rig)
-        drive(rig, control)
-        assert arm.state().q[0] > stopped[0] + 0.01
-
-
-def test_a_fault_stops_until_the_user_recovers(rig: hal.Rig, arm: hal.Robot) -> None:
-    with arm.control() as control:
-        drive(rig, control, count=10)
-        arm.inject(fault="collision")
-        rig.clock.sleep(0.1)
-        with pytest.raises(RobotFault) as caught:
-            control.send(TURN)
-        assert caught.value.cause == arm.state().fault.cause == "collision"
-        arm.recover()
-        rig.clock.sleep(0.1)
-        with pytest.raises(MotionStopped):
-            control.send(TURN)
-        control.rearm()
-        rig.clock.sleep(0.1)
-        control.send(TURN)
-
-
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("garbage", ["nan", "inf"])
 def test_impossible_values_from_an_arm_trip(rig: hal.Rig, arm: hal.Robot, garbage: str, field: str) -> None:
@@ -380,16 +286,6 @@ def test_one_arm_has_one_session(arm: hal.Robot) -> None:
             arm.move_to(arm.home)
     with arm.control():
         pass
-
-
-def test_the_exception_of_the_block_is_the_one_that_is_raised(rig: hal.Rig, arm: hal.Robot) -> None:
-    with pytest.raises(ZeroDivisionError), arm.control() as control:
-        drive(rig, control, count=10)
-        raise ZeroDivisionError
-    assert arm.state().status is RobotStatus.IDLE
-    assert np.abs(arm.state().dq_set).max() == 0.0
-    with raises_code(CommandError, "session_closed"):
-        control.send(TURN)
 
 
 def test_ctrl_c_while_a_session_opens_leaves_nothing_moving(

@@ -239,16 +239,6 @@ def send(rig: hal.Rig, count: int = 60, **grip: Any) -> None:
             control.send(REST, **grip)
 
 
-def test_a_trip_and_the_end_of_a_session_keep_the_grip(rig: hal.Rig, gripper: hal.Gripper) -> None:
-    with pytest.warns(RuntimeWarning, match="stopped"), rig.robots["panda"].control() as control:
-        for _, _ in zip(rig.clock.rate(50), range(60), strict=False):
-            control.send(REST, grip=1.0)
-        rig.clock.sleep(0.5)
-        assert control.trip is hal.Trip.COMMAND_LATE
-    rig.clock.sleep(0.5)
-    assert gripper.state().width_target == 0.0
-
-
 @pytest.mark.parametrize(
     ("passed", "expected"),
     [({"grip": 0.0}, 0.08), ({"grip": 1}, 0.0), ({"width": 0.0}, 0.0), ({"width": np.float32(0.02)}, 0.02)],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from servo_kit import Bench, tightened
+from servo_kit import FAR, Bench, tightened
 from specs import panda
 
 from hal.commands import Kind
@@ -171,22 +171,34 @@ def test_a_twist_into_a_singularity_stays_within_the_limits_and_says_so() -> Non
 BOX = WorkspaceSpec((0.25, -0.1, 0.3), (0.4, 0.1, 0.6))
 
 
+ROOM = WorkspaceSpec((0.0, -0.3, 0.2), (0.5, 0.3, 0.7))
+
+
 @pytest.mark.parametrize(
-    ("kind", "values", "face", "axis"),
+    ("kind", "values", "box", "face", "axis", "brakes"),
     [
-        (Kind.TWIST, [0.25, 0.1, 0.0, 0, 0, 0, 0], 0.4, 0),
-        (Kind.TWIST, [0.0, 0.0, -0.25, 0, 0, 0, 0], 0.3, 2),
-        (Kind.JOINT_VELOCITY, [0.8, 0, 0, 0, 0, 0, 0], 0.1, 1),
-        (Kind.JOINT_VELOCITY, [0, 0.8, 0, 0.8, 0, 0, 0], 0.4, 0),
+        (Kind.TWIST, [0.25, 0.1, 0.0, 0, 0, 0, 0], BOX, 0.4, 0, True),
+        (Kind.TWIST, [0.0, 0.0, -0.25, 0, 0, 0, 0], BOX, 0.3, 2, True),
+        (Kind.JOINT_VELOCITY, [0.8, 0, 0, 0, 0, 0, 0], BOX, 0.1, 1, True),
+        (Kind.JOINT_VELOCITY, [0, 0.8, 0, 0.8, 0, 0, 0], BOX, 0.4, 0, True),
+        # The slow-down before the faces does not suffice here; the check of where the stop would end must act.
+        (Kind.JOINT_VELOCITY, [1.5, 0, 0, 0, 0, 0, 0], ROOM, 0.3, 1, False),
+        (Kind.JOINT_VELOCITY, [-1.5, 0, 0, 0, 0, 0, 0], ROOM, -0.3, 1, False),
+        (Kind.JOINT_VELOCITY, [0, 1.5, 0, 1.0, 0, 0, 0], ROOM, 0.5, 0, False),
     ],
 )
-def test_the_workspace_is_never_left(kind: Kind, values: list[float], face: float, axis: int) -> None:
-    bench = Bench(panda(workspace=BOX), tcp_speed=0.25)
-    bench.stream(2.0, kind, values)
+def test_the_workspace_is_never_left(
+    kind: Kind, values: list[float], box: WorkspaceSpec, face: float, axis: int, brakes: bool
+) -> None:
+    spec = panda(workspace=box)
+    if not brakes:
+        spec = replace(spec, limits=tightened(spec.limits, 0.1, 0.02))
+    bench = Bench(spec, tcp_speed=0.25 if brakes else FAR)
+    bench.stream(3.0, kind, values)
     path = tcp(bench)
     assert bench.limited & Limited.WORKSPACE
-    assert (path >= np.array(BOX.lower) - 1e-6).all()
-    assert (path <= np.array(BOX.upper) + 1e-6).all()
+    assert (path >= np.array(box.lower) - 1e-6).all()
+    assert (path <= np.array(box.upper) + 1e-6).all()
     assert path[-1][axis] == pytest.approx(face, abs=5e-3)
     bench.assert_within_limits()
 
@@ -209,16 +221,3 @@ def test_quaternions(a, turn, vector):
     assert rotate(start, vector) == pytest.approx(list(matrix @ vector), abs=1e-12)
     end = after_rotation(start, turn)
     assert difference([0.0, 0.0, 0.0, *start], [1.0, 2.0, 3.0, *end]) == pytest.approx([1, 2, 3, *turn], abs=1e-7)
-
-
-@pytest.mark.parametrize("values", [[1.5, 0, 0, 0, 0, 0, 0], [-1.5, 0, 0, 0, 0, 0, 0], [0, 1.5, 0, 1.0, 0, 0, 0]])
-def test_an_arm_that_brakes_badly_keeps_the_workspace_too(values: list[float]) -> None:
-    """The slow-down before the faces does not suffice here; the check of where the stop would end must act."""
-    spec = panda(workspace=WorkspaceSpec((0.0, -0.3, 0.2), (0.5, 0.3, 0.7)))
-    bench = Bench(replace(spec, limits=tightened(spec.limits, 0.1, 0.02)))
-    bench.stream(3.0, Kind.JOINT_VELOCITY, values)
-    path = tcp(bench)
-    assert np.abs(path[:, 1]).max() <= 0.3 + 1e-6
-    assert path[:, 0].max() <= 0.5 + 1e-6
-    assert max(abs(path[-1][1]) - 0.3, path[-1][0] - 0.5) == pytest.approx(0.0, abs=1e-3)
-    bench.assert_within_limits()

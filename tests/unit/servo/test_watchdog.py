@@ -9,7 +9,6 @@ from servo_kit import Bench
 from specs import panda
 
 from hal.commands import Kind
-from hal.errors import Fault
 from hal.types import RobotStatus, Trip
 
 PATIENCE = 0.15
@@ -57,35 +56,6 @@ def test_nothing_moves_before_a_command() -> None:
     assert bench.q[0] > start[0] + 0.01
 
 
-def test_a_deadman_must_be_pressed_in_the_session() -> None:
-    bench = Bench(deadman=True, begin=False)
-    bench.press()
-    bench.begin()
-    bench.drive(0.3)
-    assert not bench.moving
-    assert bench.status is RobotStatus.HOLDING
-    bench.release()
-    bench.drive(0.1)
-    bench.press()
-    bench.drive(0.3)
-    assert bench.moving
-
-
-def test_release_stops_and_a_press_goes_on_with_a_new_command_only() -> None:
-    bench = held()
-    bench.release()
-    bench.send(Kind.JOINT_VELOCITY, [0.5] + [0.0] * 6, deadline=9.0)
-    bench.until_rest(0.5)
-    bench.run(1.0)
-    assert (bench.status, bench.trip) == (RobotStatus.HOLDING, Trip.NONE), "no deadline runs meanwhile"
-    bench.press()
-    bench.run(0.3)
-    assert not bench.moving
-    bench.drive(0.1)
-    assert bench.moving
-    bench.assert_within_limits()
-
-
 def test_a_release_between_two_ticks_is_a_release() -> None:
     bench = held()
     bench.release()
@@ -120,81 +90,12 @@ def test_a_command_that_was_sent_before_the_press_is_not_followed_after_it() -> 
     assert bench.moving
 
 
-def test_a_late_command_trips_and_only_a_new_press_goes_on() -> None:
-    bench = held()
-    sent = bench.now
-    bench.send(Kind.JOINT_VELOCITY, [0.5] + [0.0] * 6, deadline=0.1)
-    bench.run(0.1 - bench.dt)
-    assert bench.status is RobotStatus.FOLLOWING
-    bench.run(2 * bench.dt)
-    assert (bench.status, bench.trip) == (RobotStatus.TRIPPED, Trip.COMMAND_LATE)
-    assert bench.servo.report.t_trip == pytest.approx(sent + 0.1, abs=2 * bench.dt)
-    assert bench.servo.report.t_stop == bench.servo.report.t_trip
-    assert_only_a_new_press_continues(bench, Trip.COMMAND_LATE)
-
-
 def test_a_command_that_came_meanwhile_is_in_time() -> None:
     bench = held()
     bench.now += 0.2  # the host was held up; the app was not
     bench.send(Kind.JOINT_VELOCITY, [0.5] + [0.0] * 6)
     bench.tick()
     assert bench.status is RobotStatus.FOLLOWING
-
-
-@pytest.mark.parametrize(
-    ("break_it", "mend_it", "trip", "patience"),
-    [
-        ("pad_alive = False", "pad_alive = True", Trip.DEADMAN_SILENT, PAD_PATIENCE),
-        ("app_alive = False", "app_alive = True", Trip.APP_SILENT, PATIENCE),
-        ("stops += 1", "stops += 0", Trip.STOP, 0.0),
-        ("deadman = b.deadman._replace(connected=False)", "deadman = b.deadman._replace(connected=True)",
-         Trip.DEADMAN_LOST, 0.0),
-        ("deadman = None", "deadman = kept", Trip.DEADMAN_LOST, 0.0),
-        ("fault = fault", "fault = None", Trip.FAULT, 0.0),
-        ("reading = {'q': (float('nan'),) * 7}", "reading = {}", Trip.BAD_READING, 0.0),
-        ("reading = {'q': (0.0,) * 3}", "reading = {}", Trip.BAD_READING, 0.0),
-        ("reading = {'dq': (1e9,) * 7}", "reading = {}", Trip.BAD_READING, 0.0),
-        ("reading = {'q_commanded': (float('inf'),) * 7}", "reading = {}", Trip.BAD_READING, 0.0),
-        ("reading = {'t': b.now}", "reading = {}", Trip.DEVICE_LOST, PATIENCE),
-    ],
-)  # fmt: skip
-def test_every_trip_stops_latches_and_is_left_by_a_new_press(break_it, mend_it, trip, patience):
-    bench = held()
-    names = {"b": bench, "kept": bench.deadman, "fault": Fault("x", "a cause", "a remedy")}
-    begun = bench.now
-    exec(f"b.{break_it}", names)
-    while bench.trip is Trip.NONE:
-        bench.drive(bench.dt)
-        assert bench.now - begun < patience + 3 * bench.dt
-    assert bench.trip is trip
-    assert bench.now - begun >= patience - bench.dt - 1e-6, "it looks once a tick, and must not be late"
-    assert bench.moving
-    bench.until_rest(0.5)
-    assert bench.status is (RobotStatus.FAULT if trip is Trip.FAULT else RobotStatus.TRIPPED)
-    # A press while the cause lasts does not count, not even once it is gone.
-    if bench.deadman is not None:
-        bench.press_again()
-        bench.drive(0.1)
-    exec(f"b.{mend_it}", names)
-    bench.drive(0.5)
-    if trip is not Trip.STOP:  # a stop is over at once; the press above was a new one
-        assert bench.trip is trip
-        assert not bench.moving
-    assert_a_new_press_continues(bench)
-
-
-def test_a_lost_device_trips_at_once_and_braking_goes_on() -> None:
-    bench = held()
-    assert bench.lose() is not None
-    assert (bench.status, bench.trip) == (RobotStatus.LOST, Trip.DEVICE_LOST)
-    assert bench.moving
-    for _ in range(120):
-        bench.lose()
-    assert not bench.moving
-    bench.drive(0.3)
-    assert bench.trip is Trip.DEVICE_LOST
-    assert not bench.moving
-    bench.assert_within_limits()
 
 
 def test_a_press_while_the_device_is_lost_does_not_count() -> None:
@@ -205,22 +106,6 @@ def test_a_press_while_the_device_is_lost_does_not_count() -> None:
     bench.lose()
     bench.drive(0.5)
     assert bench.trip is Trip.DEVICE_LOST
-
-
-def test_without_a_deadman_a_rearm_goes_on() -> None:
-    bench = Bench()
-    bench.drive()
-    bench.stops += 1
-    bench.until_rest(0.5)
-    assert bench.trip is Trip.STOP
-    bench.drive(0.3)
-    assert not bench.moving
-    bench.rearm()
-    bench.run(0.2)
-    assert bench.trip is Trip.NONE
-    assert not bench.moving
-    bench.drive(0.3)
-    assert bench.moving
 
 
 @pytest.mark.parametrize("known_stops", [0, None], ids=["unknown to the app", "known to the app"])
