@@ -18,6 +18,7 @@ from hal import (
     JointVelocity,
     MotionStopped,
     NotSupported,
+    RobotFault,
     RobotStatus,
     Trip,
     Twist,
