@@ -162,6 +162,7 @@ NONSENSE = {
     "inf": inject(garbage="inf"),
     "beyond the range": report(q=(2.8973 + 1.01, *HOME)),
     "too fast": report(dq=(1001.0, *[0.0] * 6)),
+    # Also in what the servo does not need: a reading with such a number is not one.
     **{
         f"{name}: {value}": report(**{name: (value, *[0.0] * (5 if name == "wrench_ext" else 6))})
         for name in ("dq", "q_commanded", "dq_commanded", "tau", "tau_ext", "wrench_ext")
