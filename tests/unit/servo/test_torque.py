@@ -199,17 +199,6 @@ class TestStopping:
         assert abs(torques[-1]) <= 990.0 * arm.dt
         arm.assert_within_limits()
 
-    def test_without_a_deadman_a_rearm_goes_on(self) -> None:
-        arm = wheels(deadman=False)
-        arm.drive(0.2, one(0, 3.0))
-        arm.stops += 1
-        arm.until_held()
-        arm.drive(0.2, one(0, 3.0))
-        assert arm.state == (RobotStatus.TRIPPED, Trip.STOP)
-        arm.rearm()
-        arm.drive(0.2, one(0, 3.0))
-        assert arm.state == (RobotStatus.FOLLOWING, Trip.NONE)
-
     def test_a_session_that_ends_is_over_once_it_rests(self) -> None:
         arm = moving()
         arm.servo.close_session()
