@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, ClassVar
 
 from hal.driver import Reading, RobotDriver, Setpoint
@@ -31,6 +31,8 @@ __all__ = ["DamiaoArm"]
 
 _STICKING = 0.02
 """Speed below which the friction that a command adds falls to zero, rad/s: it would make a joint at rest tremble."""
+_PUSHING = 0.5
+"""An arm is blocked if a joint's distance from its set-point lets the motor push with this share of its torque."""
 _BRAKE = 0.3
 """Share of a motor's damping in torque mode: it bounds the speed where the torques are no longer renewed."""
 _ATTEMPTS = 3
@@ -59,6 +61,11 @@ class DamiaoArm(RobotDriver):
         self.engaged = False
         self._fault: Fault | None = None
         """Fault of a motor; kept until recover()."""
+        self._following = [
+            min(settings.following_limit, _PUSHING * motor.limits.torque / motor.kp) if motor.kp > 0.0 else inf
+            for motor in settings.motors
+        ]
+        """Largest distance of each joint from its set-point, rad."""
         friction = [motor.friction for motor in settings.motors]
         self._friction = friction if any(friction) else None
         zeros = (0.0,) * len(self._motors)
@@ -182,8 +189,7 @@ class DamiaoArm(RobotDriver):
         """Return a fault, and hold the measured position, if a joint is too far from its set-point."""
         if not self.engaged or self._tau_sent is not None:
             return None
-        limit = self.settings.following_limit
-        for motor, target in zip(self._motors, self._target, strict=True):
+        for motor, target, limit in zip(self._motors, self._target, self._following, strict=True):
             if abs(motor.q - target) > limit:
                 self._target = [motor.q for motor in self._motors]
                 self._holds = None
@@ -308,18 +314,17 @@ class DamiaoArm(RobotDriver):
         self.chain.switch_on(motor, hold)
 
     def _give_up(self, motor: ChainMotor) -> None:
-        """Leave the motors that are on to their own time-out, and raise RobotFault."""
+        """Raise RobotFault for a motor that does not switch on; those that are on continue to hold."""
         self._switching = None
-        for one in self._motors:
-            one.on = False
+        motor.on = False
         raise RobotFault(
-            f"{self.spec.name}: {motor.label} does not switch on (status {motor.status:x})",
-            "check its power supply; switch the arm off and on again",
+            f"{self.spec.name}: {motor.label} does not switch on (status {motor.status:x}); the others hold",
+            "support the arm, since this joint is limp; check the motor's power supply; closing the rig lowers the arm",
             code="not_switched_on",
         )
 
     def recover(self) -> None:
-        """Clear the motors' errors. Nothing is switched on.
+        """Clear the errors of motors that apply no torque. Nothing is switched on, and no motor lets go.
 
         Raises:
             RobotFault: An error stays, or a motor is still too hot; names the motor.

@@ -24,6 +24,7 @@ from .damiao_protocol import (
     DISABLE,
     ENABLE,
     REGISTER_ID,
+    MotorStatus,
     encode_register_read,
 )
 from .settings import BusSettings, DamiaoMotorSettings, emulator_remedy, is_emulated
@@ -399,7 +400,10 @@ class DamiaoChain:
         return mild
 
     def clear_errors(self) -> None:
-        """Clear the errors of all motors that have one; those are then off. Takes up to 30 ms.
+        """Clear the errors of all motors that have one and apply no torque; those stay without. Takes up to 30 ms.
+
+        A motor that lost communication damps, and carries a part of the arm by that. Cleared it would be off, and the
+        arm would fall: :meth:`switch_on` clears it together with its first command.
 
         Raises:
             RobotFault: An error stays; names the motor.
@@ -407,7 +411,7 @@ class DamiaoChain:
         """
         bus = self.usable
         deadline = time.monotonic() + _CLEARING
-        while wrong := [motor for motor in self.motors if motor.status > 1]:
+        while wrong := [m for m in self.motors if m.status > 1 and m.status != MotorStatus.LOST_COMMUNICATION]:
             if time.monotonic() > deadline:
                 fault = self.fault(engaged=True)
                 assert fault is not None

@@ -101,6 +101,8 @@ class PiperArm(RobotDriver):
         self._t_pairs = -inf
         self._commanded: tuple[float, ...] | None = None
         self._commanded_dq: tuple[float, ...] = _NO_JOINTS
+        self._held: tuple[float, ...] | None = None
+        """Measured position that the arm holds since it did not follow, rad; None otherwise."""
         self._fault: Fault | None = None
         """Error that ended the engagement; kept until recover(), even if the arm no longer reports it."""
         self._t_asked = self._t_engaging = self._t_last_try = -inf
@@ -172,6 +174,7 @@ class PiperArm(RobotDriver):
             raise self._link.lose(f"the arm has sent no {self._silent_part(now)}")
         self._link.lost = None
         fault = self._present_fault()
+        self._hold_measured()
         commanded, commanded_dq = (self._commanded, self._commanded_dq) if self.engaged else (None, None)
         return Reading(
             self._t_q, self._t_q, self._seq, q, tuple(self._dq), tuple(self._tau), commanded, commanded_dq, fault=fault
@@ -228,9 +231,19 @@ class PiperArm(RobotDriver):
             fault = fault or control_fault(status, self._flags) or self._check_following()
             if fault is not None:
                 self._fault = fault
+                self._held = self._q if fault.code == "not_following" else None
                 self._disengage()
                 self.faults += 1
         return self._fault or fault
+
+    def _hold_measured(self) -> None:
+        """Command an arm that did not follow to stay where it was: it neither pushes on nor leaps once it is free."""
+        status = self._status
+        assert status is not None
+        if self._fault is None or status.control in _OTHERS_CONTROL:
+            self._held = None
+        elif self._held is not None:
+            self._link.send(encode_joint_targets(self._held))
 
     def _check_following(self) -> Fault | None:
         """Return a fault if a joint is too far from its target: the arm would race there as soon as it can."""

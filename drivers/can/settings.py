@@ -262,7 +262,8 @@ class DamiaoArmSettings(BusSettings):
     """Temperature at which the motors' electronics switch off, deg C: fixed, by Damiao's manual of the DM9008; assumed
     for the other types. The rotor's is the register OT_VALUE, for which that manual advises 100 at most."""
     following_limit: FollowingLimit = 0.5
-    """Largest distance of a joint from its set-point, rad. Beyond it the arm is blocked, and holds where it is."""
+    """Largest distance of a joint from its set-point, rad. Beyond it, or where the motor pushes with half of its
+    greatest torque because of it, the arm is blocked, and holds where it is."""
 
     @classmethod
     def of(cls, spec: RobotSpec) -> DamiaoArmSettings:

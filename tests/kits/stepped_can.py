@@ -142,9 +142,10 @@ class SteppedArm:
 
 
 def take_for_off(driver: Any) -> None:
-    """Let a driver believe that its motors are off: otherwise its close lowers the arm for up to six seconds."""
-    for motor in driver.chain.motors:
-        motor.on = False
+    """Let a Damiao driver believe that its motors are off: otherwise its close lowers the arm for up to six seconds."""
+    if hasattr(driver, "chain"):
+        for motor in driver.chain.motors:
+            motor.on = False
 
 
 @contextlib.contextmanager

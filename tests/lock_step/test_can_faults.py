@@ -25,7 +25,7 @@ from hal.driver import GripperReading, Reading
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
-from hal.drivers.can.damiao_protocol import MOTOR_RANGES, MotorCodec, MotorStatus
+from hal.drivers.can.damiao_protocol import ENABLE, MOTOR_RANGES, MotorCodec, MotorStatus
 from hal.errors import ConfigError, DeviceNotFound, HalError, MotionStopped, RobotFault
 from hal.host.cycle import Cycle
 from hal.host.records import AppRecord, GroupMemory
@@ -542,3 +542,51 @@ def test_a_gripper_holds_while_its_arm_sinks() -> None:
         assert len(weakest) * DT > 1.0, "it sinks for longer than TIMEOUT"
         assert held > 0.2
         assert min(weakest) == pytest.approx(held, rel=0.1)
+
+
+def fastest(arm: SteppedArm, seconds: float) -> float:
+    """Let time pass; return the greatest speed of a joint meanwhile, rad/s."""
+    found = 0.0
+    for _ in range(round(seconds / 0.02)):
+        arm.run(0.02)
+        found = max(found, float(np.abs(arm.dq).max()))
+    return found
+
+
+def test_recover_lets_go_of_no_motor_that_carries_the_arm() -> None:
+    """Motors that heard nothing for longer than their TIMEOUT damp; switched off, they would let the arm fall."""
+    with driven() as arm:
+        starve(arm)
+        arm.run(0.1)
+        sinking = fastest(arm, 0.3)
+        arm.robot.recover()
+        assert fastest(arm, 0.6) <= max(0.5, 1.1 * sinking)
+        assert {motor.status for motor in arm.driver.chain.motors} == {MotorStatus.LOST_COMMUNICATION}
+
+
+def test_a_motor_that_does_not_switch_on_leaves_the_others_holding() -> None:
+    with driven() as arm:
+        wrist = arm.far.arm.motors[5]
+        command = wrist.command
+        wrist.command = lambda data: None if data == ENABLE else command(data)
+        arm.far.execute("status 5 B")
+        arm.run(0.2)
+        arm.robot.recover()
+        arm.control.rearm()
+        error = arm.run(2.0, STILL)
+        assert error is not None
+        assert "joint5" in str(error)
+        assert fastest(arm, 1.0) <= 0.5
+        assert [motor.on for motor in arm.driver.chain.motors] == [True, True, True, True, False, True]
+
+
+def test_a_blocked_piper_stops_pushing_and_does_not_leap_once_it_is_free() -> None:
+    with stepped_arm("piper") as arm:
+        assert arm.run(0.4, TURN) is None
+        arm.far.arm.plant.held = True  # in front of an obstacle
+        fault = arm.run(3.0, TURN)
+        assert isinstance(fault, RobotFault)
+        arm.run(0.1)
+        assert np.abs(np.array(arm.far.arm.target) - arm.q).max() < 0.02
+        arm.far.arm.plant.held = False
+        assert fastest(arm, 1.0) <= 0.5
