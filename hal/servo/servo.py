@@ -64,7 +64,8 @@ class ServoReport:
     held_back: Limited = Limited.NONE
     """Limits by which the servo reduced the motion of the session, since it was opened."""
     off_path: bool = False
-    """Whether the arm cannot continue on the path of its session: it was moved too far off, or no plan leads on."""
+    """Whether the arm cannot continue on the path of its session: it was moved too far off, no plan leads on, or it
+    made no progress for :data:`PATIENCE`."""
     overrun: Limited = Limited.NONE
     """Limit that the arm reached when ``Trip.LIMIT`` was latched; ``NONE`` if it could not be braked."""
     t_trip: float = 0.0
@@ -83,6 +84,9 @@ _POSITION = ControlMode.POSITION
 
 _ABSURD = 1e3
 """Joint speeds beyond this are an invalid reading, rad/s."""
+
+PATIENCE = 10.0
+"""A motion that is allowed to move, and makes no progress for so long, is given up, s."""
 
 _BEYOND = 1.0
 """Joint positions this far beyond the joint's range are an invalid reading, rad."""
@@ -149,6 +153,8 @@ class Servo:
         """Number of the newest command that was handled or is no longer valid."""
         self._braking = 0.0
         """Time for which a controller has held a session open that is closing, s."""
+        self._stuck = 0.0
+        """Time for which the motion of the session has made no progress, s."""
         self._resting = 0
         """Number of ticks for which a session that is closing has been at rest."""
         self._corrected = False
@@ -232,7 +238,7 @@ class Servo:
         self._session = session
         self._ending = self._ahead = False
         self._resting = 0
-        self._braking = 0.0
+        self._braking = self._stuck = 0.0
         self._ready = None
         self._seq = 0
         self.report.target_seq = self.report.refused = 0
@@ -531,6 +537,8 @@ class Servo:
         """Report how far the motion of the session is."""
         report = self.report
         report.arrived = motion.arrived and (not self._compliance.active or self._torque.still)
+        self._stuck = 0.0 if motion.progress != report.progress else self._stuck + self._smoother.dt
+        motion.lost = motion.lost or (self._stuck > PATIENCE and not motion.arrived)
         report.progress = motion.progress
         report.held_back |= self._envelope.limited
         report.off_path = motion.lost
