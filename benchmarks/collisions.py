@@ -1,6 +1,6 @@
 """Check the verdicts of collisions against PyBullet's, and that motions that would collide are refused or stopped.
 
-    python benchmarks/collisions.py [targets|tour|verdicts|arms|torques|pushes|tick] [--count N]
+    python benchmarks/collisions.py [targets|tour|verdicts|starts|arms|torques|pushes|tick] [--count N]
 
 Each row is a function that returns its numbers, so that the tests run the same with small counts.
 """
@@ -277,6 +277,46 @@ def targets(count: int) -> dict[str, float]:
     }
 
 
+def starts(model_name: str, count: int) -> dict[str, float]:
+    """Move an arm home from random positions inside a margin; return how the motions end."""
+    spec = arm(model_name)
+    model, home = CollisionModel([spec], CollisionSpec()), np.array(spec.home)
+    rng = np.random.default_rng(3)
+    ends = {"came home": 0, "refused at once": 0, "given up": 0, "without an end": 0}
+
+    def room(q: np.ndarray) -> float:
+        model.place(q)
+        return float((model.distances() - model.margins).min())
+
+    for q in configurations(spec, 1000 * count, seed=5):
+        if sum(ends.values()) == count:
+            break
+        if room(q) >= 0.0:
+            continue
+        inside = -0.01 * rng.uniform() * 10.0 ** rng.integers(-2, 1)
+        low, high = 0.0, 1.0  # shares of the way from home
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if room(home + middle * (q - home)) < inside else (middle, high)
+        start = home + high * (q - home)
+        if not -0.01 < room(start) < 0.0:
+            continue
+        overrides = {"robots.arm.initial": start.tolist()}
+        rig_file = {"robots": {"arm": {"model": model_name}}}
+        with hal.open(rig_file, driver="mock", clock="lock_step", pad="none", overrides=overrides) as rig:
+            try:
+                rig.robots["arm"].move_to(home, timeout=60.0)
+            except hal.CollisionError:
+                ends["refused at once"] += 1
+            except hal.MotionStopped:
+                ends["given up"] += 1
+            except TimeoutError:
+                ends["without an end"] += 1
+            else:
+                ends["came home"] += 1
+    return ends
+
+
 def tour(seconds: float) -> dict[str, float]:
     """Play the recorded drives in simulation; return how near the arm came to anything, and whether it was slowed."""
     found: dict[str, float] = {}
@@ -381,6 +421,7 @@ ROWS = {
     "targets": lambda count: targets(count or 1000),
     "tour": lambda count: tour(count or 60),
     "verdicts": lambda count: {m: verdicts(m, count or 10_000) for m in ("panda", "fr3", "iiwa")},
+    "starts": lambda count: {m: starts(m, count or 1000) for m in ("so101", "panda", "ur5e", "yam", "piper")},
     "arms": lambda count: arms(count or 100),
     "torques": lambda count: torques(count or 50),
     "pushes": lambda count: pushes(),

@@ -24,7 +24,7 @@ _STEP = 1e-3
 """A way along which two shapes come this much nearer at most is checked at its ends only, m."""
 _SAME_PLACE = 1e-3
 """Bases of two arms that are this near are in one place, m."""
-_TOLERANCE = 1e-4
+_TOLERANCE = 5e-6
 """Shapes that are nearer than the margin where a motion begins may come so much nearer still, m."""
 
 

@@ -178,7 +178,8 @@ class ArmMotion:
                 if servo.session == session._id:
                     if servo.off_path:
                         raise MotionStopped(
-                            f"{robot.name} cannot continue on its path: it was moved away from it, or no plan leads on",
+                            f"{robot.name} cannot continue on its path: it was moved away from it, no plan leads on, "
+                            "or it made no progress for 10 s",
                             "plan a new motion",
                             code="off_path",
                         )

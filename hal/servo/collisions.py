@@ -32,8 +32,12 @@ Neighbour = Callable[[], tuple[Floats, Floats]]
 """Returns the joint positions (n,), rad, of another arm, and where a stop that it begins now would end."""
 
 _SPACING = 0.01
-"""A stop is checked at positions between which no two shapes come this much nearer, m; at most so many:"""
+"""A way is sampled at positions between which no two shapes come this much nearer, m; at most so many:"""
 _SAMPLES = 4
+_CUTS = 16
+"""A stop is cut at so many times at most to prove that it keeps a margin; a step whose stop needs more is refused."""
+RESERVE = 3e-4
+"""Goals and planned motions stay so much farther away than the margin, m, that a few cuts suffice for a proof."""
 _TOLERANCE = 1e-5
 """Accuracy of distances that are compared, m."""
 _NOWHERE = 1e-12
@@ -122,9 +126,12 @@ class CollisionGuard:
             near, before.tolist(), after, fastest.tolist(), others.tolist(), strict=True
         ):
             speed = (d - d_ahead) / ahead
+            left = d - self._margins[k] - RESERVE - taken
+            if most > 0.0:  # the stop has to be proven, whatever its direction
+                share = min(share, speed_for(_CUTS * max(left, RESERVE), slowest * most, smoothest * most) / most)
             if speed <= _SIDEWAYS * most:
                 continue
-            left = d - self._margins[k] - taken - ticks * speed
+            left -= ticks * speed
             cap = speed_for(left, slowest * speed, smoothest * speed)
             share = min(share, cap / speed)
         if share >= 1.0:
@@ -150,19 +157,22 @@ class CollisionGuard:
         if not near:
             self._floors.clear()
             return True
-        lowest = self._lowest(near, q, dq, ddq, ways)
-        tight = [(k, d) for k, d in zip(near, lowest, strict=True) if d < self._margins[k] - _TOLERANCE]
+        tight = self._unproven(near, q, dq, ddq)
+        self._floors = {k: floor for k, floor in self._floors.items() if k in tight}
         if not tight:
             return True
-        pairs = [k for k, _ in tight]
         v0, a0 = smoother.dq, smoother.ddq
-        ways = [
+        present_ways = [
             max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) for v, a, (A, J) in zip(v0, a0, limits, strict=True)
         ]
-        around.near(smoother.q, ways)
-        present = self._lowest(pairs, smoother.q, v0, a0, ways)
-        floors = [self._floor(k, now) for k, now in zip(pairs, present, strict=True)]
-        return all(d >= floor - _TOLERANCE for (_, d), floor in zip(tight, floors, strict=True))
+        around.near(smoother.q, present_ways)
+        present = self._lowest(tight, smoother.q, v0, a0, present_ways)
+        margins = [self._margins[k] - _TOLERANCE for k in tight]
+        if any(now >= margin and k not in self._floors for k, now, margin in zip(tight, present, margins, strict=True)):
+            return False
+        ahead = self._lowest(tight, q, dq, ddq, ways)
+        nearest = [min(self._floor(k, now) - _TOLERANCE, now) for k, now in zip(tight, present, strict=True)]
+        return all(d >= least for d, least in zip(ahead, nearest, strict=True))
 
     def allows_arm(self, q: Floats, dq: Floats, seconds: float) -> bool:
         """Return whether an arm that follows the set-point by a controller's torques keeps apart.
@@ -190,17 +200,57 @@ class CollisionGuard:
         It never falls because of this arm's own motion, so that the arm cannot creep nearer.
         """
         margin = self._margins[k]
-        floor = self._floors.get(k, margin)
+        floor = self._floors.get(k, min(margin, now))
         if now < floor - 10.0 * _TOLERANCE:
             floor = now
-        elif now > floor:
-            floor = min(margin, now)
+        else:
+            floor = max(floor, min(margin, now - 5.0 * _TOLERANCE))
         self._floors[k] = floor
         return floor
 
     def _braking_way(self, v: float, A: float, J: float) -> float:
         """Return the way (rad) in which a joint brakes gently from the speed ``v`` (rad/s), and of two ticks before."""
         return stop_distance(v, _BRAKE * A, _BRAKE_JERK * J) + 2.0 * self._smoother.dt * v
+
+    def _unproven(self, pairs: Sequence[int], q: Floats, dq: Floats, ddq: Floats) -> list[int]:
+        """Return the pairs for which it is not proven that the stop from ``q``, ``dq``, ``ddq`` keeps their margins.
+
+        Between two times at which shapes have the distances d and e, while they come at most w nearer, they are nowhere
+        nearer than (d + e - w) / 2. Where that is too little, the distance is computed in between.
+        """
+        smoother, around = self._smoother, self._around
+        state = list(zip(q, dq, ddq, smoother.acceleration, smoother.jerk, strict=True))
+        turned = [  # a joint that turns back goes there and back beyond the difference of two positions
+            2.0 * max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) if v * (v + 0.5 * a * abs(a) / J) < 0.0 else 0.0
+            for _, v, a, A, J in state
+        ]
+        duration = max([stop_phases(v, a, A, J)[3] for _, v, a, A, J in state])
+        levers, taken = around.model.levers[pairs], around.approach_of_others(pairs)
+        least = around.model.margins[pairs] - _TOLERANCE
+        own = levers[:, around.own]
+
+        def look(t: float) -> tuple[float, Array, Array]:
+            place = [stop_step(x, v, a, A, J, t)[0] for x, v, a, A, J in state] if t > 0.0 else list(q)
+            return t, np.array(place), np.array(around.lowest(pairs, [place]))
+
+        ends = look(0.0), look(duration)
+        bad = np.minimum(ends[0][2], ends[1][2]) < least
+        parts = [ends]
+        cuts = 0
+        while parts and not bad.all():
+            (t0, x0, d), (t1, x1, e) = parts.pop()
+            ways = own @ (np.abs(x1 - x0) + turned) + taken
+            unsure = (0.5 * (d + e - ways) < least) & ~bad
+            if not unsure.any():
+                continue
+            if cuts == _CUTS:
+                bad |= unsure
+                continue
+            cuts += 1
+            middle = look(0.5 * (t0 + t1))
+            bad |= middle[2] < least
+            parts += [(middle, (t1, x1, e)), ((t0, x0, d), middle)]
+        return [k for k, wrong in zip(pairs, bad.tolist(), strict=True) if wrong]
 
     def _lowest(self, pairs: Sequence[int], q: Floats, dq: Floats, ddq: Floats, ways: Floats) -> list[float]:
         """Return the smallest distance of each pair in the stop that begins at ``q``, ``dq``, ``ddq``, m."""

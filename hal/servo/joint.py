@@ -378,7 +378,7 @@ class PathMotion(ServoMotion):
         super().__init__(smoother, envelope)
         self.arrived = False
         self.lost = False
-        """Always False: from wherever the arm is, a straight line leads to the goal."""
+        """Whether the motion was given up because it made no progress."""
         self.progress = 0.0
         """Share of the way from the first start that is done, from 0 to 1."""
         self._whole_way = 0.0
@@ -420,7 +420,7 @@ class PathMotion(ServoMotion):
         self._whole_way = max([abs(x - y) for x, y in zip(inside, smoother.q, strict=True)])
         self._share = 1.0
         self.progress = 0.0
-        self.arrived = False
+        self.arrived = self.lost = False
         self._planned = False
 
     def start(self) -> None:
@@ -434,6 +434,9 @@ class PathMotion(ServoMotion):
 
     def step(self, now: float) -> None:
         smoother = self.smoother
+        if self.lost:
+            smoother.stop()
+            return
         if not self._planned:
             if now < self._t_retry:
                 self.envelope.limited |= Limited.COLLISION

@@ -36,7 +36,8 @@ class ServoReport:
     held_back: Limited = Limited.NONE
     """Limits by which the servo reduced the motion of the session, since it was opened."""
     off_path: bool = False
-    """Whether the arm cannot continue on the path of its session: it was moved too far off, or no plan leads on."""
+    """Whether the arm cannot continue on the path of its session: it was moved too far off, no plan leads on, or it
+    made no progress for 10 s."""
     overrun: Limited = Limited.NONE
     """Limit that the arm reached when ``Trip.LIMIT`` was latched; ``NONE`` if it could not be braked."""
     t_trip: float = 0.0

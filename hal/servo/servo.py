@@ -44,6 +44,9 @@ _POSITION = ControlMode.POSITION
 _ABSURD = 1e3
 """Joint speeds beyond this are an invalid reading, rad/s."""
 
+PATIENCE = 10.0
+"""A motion that is allowed to move, and makes no progress for so long, is given up, s."""
+
 _BEYOND = 1.0
 """Joint positions this far beyond the joint's range are an invalid reading, rad."""
 
@@ -113,6 +116,8 @@ class Servo:
         """Number of the newest command that was handled or is no longer valid."""
         self._braking = 0.0
         """Time for which a controller has held a session open that is closing, s."""
+        self._stuck = 0.0
+        """Time for which the motion of the session has made no progress, s."""
         self._resting = 0
         """Number of ticks for which a session that is closing has been at rest."""
         self._extrapolates = extrapolates
@@ -199,7 +204,7 @@ class Servo:
         self._session = session
         self._ending = False
         self._resting = 0
-        self._braking = 0.0
+        self._braking = self._stuck = 0.0
         self._ahead = None
         self._seq = 0
         self.report.target_seq = self.report.refused = 0
@@ -523,6 +528,8 @@ class Servo:
         """Report how far the motion of the session is."""
         report = self.report
         report.arrived = motion.arrived and (not self._compliance.active or self._torque.still)
+        self._stuck = 0.0 if motion.progress != report.progress else self._stuck + self._smoother.dt
+        motion.lost = motion.lost or (self._stuck > PATIENCE and not motion.arrived)
         report.progress = motion.progress
         report.held_back |= self._envelope.limited
         report.off_path = motion.lost

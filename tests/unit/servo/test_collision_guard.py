@@ -17,7 +17,8 @@ from hal.kinematics.arm import Kinematics
 from hal.kinematics.collision_model import CollisionModel
 from hal.servo.audit import SetpointAudit
 from hal.servo.collisions import CollisionGuard, Neighbour
-from hal.servo.servo import Servo
+from hal.servo.servo import PATIENCE, Servo
+from hal.servo.smoothing import stop_phases, stop_step
 from hal.specs import BoxSpec, CollisionSpec, RobotSpec
 from hal.types import Limited
 
@@ -149,9 +150,21 @@ def test_move_to_waits_for_an_arm_in_its_way(panda: RobotSpec) -> None:
     assert not bench.servo.report.arrived
     assert bench.nearest > -1e-4
     assert Limited.COLLISION in bench.servo.report.limited
+    assert not bench.servo.report.off_path
     at[:] = away
     bench.run(8.0)
     assert bench.servo.report.arrived
+
+
+def test_move_to_is_given_up_if_what_is_in_its_way_stays(panda: RobotSpec) -> None:
+    other = replace(panda, name="other", base_position=(1.15, 0.0, 0.0), base_orientation=(0.0, 0.0, 1.0, 0.0))
+    at = (0.0, 0.3, 0.0, -1.9, 0.0, 2.2, 0.8)
+    bench = Bench(panda, CollisionSpec(), [(other, lambda: (at, at))])
+    bench.start(panda.home, (0.0, 0.5, 0.0, -1.6, 0.0, 2.1, 0.785))
+    bench.run(PATIENCE + 4.0)
+    assert bench.servo.report.off_path
+    assert not bench.servo.report.arrived
+    assert bench.servo.smoother.at_rest()
 
 
 class MeasuredArm:
@@ -227,3 +240,30 @@ def test_a_compliant_arm_is_checked_off_its_set_point(panda: RobotSpec) -> None:
     speed = (np.subtract(arm.lower(0.01), arm.q) / 0.01 * 0.5).tolist()  # 0.5 m/s down
     assert not arm.guard.allows_arm(arm.q, speed, 0.06)
     assert arm.guard.allows_arm(arm.q, [-v for v in speed], 0.06)
+
+
+def test_no_stop_of_an_accepted_state_enters_a_margin(panda: RobotSpec) -> None:
+    model = CollisionModel([panda], CollisionSpec(boxes=(TABLE,)))
+    smoother = Servo(panda, 1.0 / RATE_HZ).smoother
+    guard = CollisionGuard(model, smoother)
+    guard.open(panda.limits.velocity)
+    velocity = np.array(panda.limits.velocity)
+    rng = np.random.default_rng(2)
+    accepted = refused = 0
+    for q in np.clip(OVER_THE_TABLE + rng.normal(0.0, 0.4, (300, 7)), panda.limits.lower, panda.limits.upper):
+        dq = rng.uniform(-velocity, velocity)
+        model.place(q)
+        if (model.distances() < model.margins).any():
+            continue
+        smoother.anchor(q.tolist())
+        smoother.q_next, smoother.dq_next, smoother.ddq_next = q.tolist(), dq.tolist(), [0.0] * 7
+        if not guard.allows():
+            refused += 1
+            continue
+        accepted += 1
+        joints = list(zip(q, dq, smoother.acceleration, smoother.jerk, strict=True))
+        for t in np.linspace(0.0, max(stop_phases(v, 0.0, A, J)[3] for _, v, A, J in joints), 30):
+            model.place([stop_step(x, v, 0.0, A, J, t)[0] for x, v, A, J in joints])
+            assert (model.distances() - model.margins).min() > -2e-5
+    assert accepted > 50
+    assert refused > 3
