@@ -49,8 +49,8 @@ from may be off by another rounding."""
 _ROUNDED_STEP = 3e-10
 """The same for the speed that it reports, as the way of one cycle, rad: at 1 kHz and 2 rad/s two roundings."""
 
-_CLOSE = 30.0
-"""A lost set-point is recognised if the reported speed fits within so many roundings."""
+_CLOSE = 10.0
+"""A lost set-point is recognised if the reported speed fits it so many times as well as a set-point that was taken."""
 
 _AWAY = 1e-2
 """After a silence, an arm this far from its set-point restarts from its measured position, rad (if it does not report
@@ -144,6 +144,8 @@ class Anchoring:
         steps = [smoother.dt * v for v in smoother.dq]
         self._track: list[Floats] = [[x - k * step for x, step in zip(q, steps, strict=True)] for k in range(3)]
         """Where the device was in its last three cycles, newest first, rad."""
+        self._dq: Floats | None = None
+        """Its speed in the newest of them, as it reports it, rad/s; None if that does not fit."""
         self._fresh = True
         """Whether nothing was given since."""
         self._silent = False
@@ -202,7 +204,7 @@ class Anchoring:
 
     def _note_taken(self) -> None:
         """Note that the device took the last set-point."""
-        self._track = [self._motion[0], *self._track[:2]]
+        self._track, self._dq = [self._motion[0], *self._track[:2]], None
 
     def _find_lost(self, reading: Reading, cycles: int) -> bool:
         """Find out what the device did in its last ``cycles``; returns whether the smoother was corrected."""
@@ -214,23 +216,46 @@ class Anchoring:
         took = _continued([self._motion[0], *self._track], cycles - 1)
         off, step_off = self._distances(q, dq, took)
         if cycles == 1 and off <= _ROUNDED and step_off <= _ROUNDED_STEP:
-            self._track = took[:3]
+            self._track, self._dq = took[:3], dq
             self.error = max(self.error, off)
             return False
         lost = _continued(self._track, cycles)
         lost_off, lost_step_off = self._distances(q, dq, lost)
-        fits = lost_off <= cycles * _ROUNDED and lost_step_off <= cycles * _CLOSE * _ROUNDED_STEP
         # The speeds distinguish a small loss from none: they are a thousand times as exact as the positions.
-        is_lost = fits and lost_off + 2.0 * lost_step_off < off + 2.0 * step_off
+        is_lost = lost_off <= cycles * _ROUNDED and _CLOSE * lost_step_off < step_off
         self._judge(reading, lost_off if is_lost else off)
         track, count = (lost, cycles) if is_lost else (took, cycles - 1)
         self.lost += count
+        agreed = (lost_step_off if is_lost else step_off) <= cycles * _ROUNDED
+        if agreed and dq is not None and self._dq is not None:
+            track = self._refined(self._track[0] if is_lost else self._motion[0], cycles, int(is_lost), self._dq, dq)
+        self._dq = dq if agreed else None
         if count and self._allows(at := self._state(track)):
             self._track = track[:3]
             self._smoother.anchor(*at[:3])
             return True
         self._note_taken()
         return False
+
+    def _refined(self, q: Floats, cycles: int, more: int, before: Floats, dq: Floats) -> list[Floats]:
+        """Return where the device was in its last three cycles, newest first, by the speeds that it reports.
+
+        They are more exact than the positions, so that what was too small to be noticed does not grow. In all
+        ``cycles`` the speed changed by the same, from ``before`` to ``dq`` (n,), rad/s.
+
+        Args:
+            q: The position (n,), rad, after which it extrapolated: the one before these cycles, or the set-point.
+            cycles: Number of cycles.
+            more: Number of cycles, beyond ``cycles`` - 1, for which it extrapolated.
+            before: Speed before these cycles.
+            dq: Speed after them.
+        """
+        dt, count = self._smoother.dt, cycles - 1 + more
+        middle = cycles - 0.5 * (count - 1)  # of the cycles in which it extrapolated, counted from 1
+        steps = [(v - v0) / cycles for v, v0 in zip(dq, before, strict=True)]
+        a = [x + dt * count * (v0 + middle * step) for x, v0, step in zip(q, before, steps, strict=True)]
+        b = [x - dt * v for x, v in zip(a, dq, strict=True)]
+        return [a, b, [x - dt * (v - step) for x, v, step in zip(b, dq, steps, strict=True)]]
 
     def _distances(self, q: Floats, dq: Floats | None, track: Sequence[Floats]) -> tuple[float, float]:
         """Return how far a report is from the newest position of ``track``, and its speed from the last step, rad."""

@@ -8,6 +8,7 @@ import random
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -15,6 +16,8 @@ from servo_kit import STILL, Bench, N
 from specs import panda
 
 from hal.commands import Kind
+from hal.driver import Reading
+from hal.drivers.franka.emulator.motion import at_rest, by_position, extrapolated
 from hal.errors import Fault
 from hal.kinematics.arm import Kinematics
 from hal.servo.anchoring import LATEST
@@ -93,6 +96,43 @@ def test_a_device_that_misses_set_points(kind: str, loss: float, burst: int) -> 
         peaks = peaks_of(bench, device.history)
     assert peaks["velocity"] > 0.1
     assert max(peaks.values()) <= (1.0 if kind == "repeats" else 1.0001), peaks
+
+
+LATENESS = [(0.02, 0.3, 15), (0.1, 0.1, 15), (0.3, 0.1, 4), (0.6, 0.0, 2), (0.4, 0.1, 8)]
+"""Share of set-points that come late, share of readings that do, and for how many cycles these do at most."""
+
+
+@pytest.mark.parametrize("lateness", LATENESS)
+def test_a_robot_is_followed_through_any_late_set_points_and_readings(lateness: tuple[float, float, int]) -> None:
+    """An FR3's reports in single precision; what it commands itself has the limits of what is sent."""
+    late, gap, longest = lateness
+    chance = random.Random(str(lateness))
+    bench = Bench(rate_hz=1000.0, extrapolates=True, speed=0.3, tcp_speed=0.25)
+    robot, cycle, sent = at_rest(bench.q), 0, None
+    commanded, lost = [robot.q], 0
+    while cycle < 3000:
+        cycles = chance.randint(2, longest) if chance.random() < gap else 1
+        for k in range(cycles):
+            takes = k == 0 and sent is not None and chance.random() >= late
+            robot = by_position(robot, sent) if takes else extrapolated(robot)
+            commanded.append(robot.q)
+            lost += not takes
+        before, cycle = cycle, cycle + cycles
+        t = bench.now = cycle * bench.dt
+        if before // 20 != cycle // 20:
+            turn = [0.1 * math.sin(2 * t), 0.1 * math.cos(3 * t), 0.05 * math.sin(t), 0.0, 0.2, 0.3 * math.sin(2 * t)]
+            bench.send(Kind.TWIST, [*turn, 0.0])
+        q, dq = (np.array(values, np.float32).tolist() for values in (robot.q, robot.dq))
+        reading = Reading(t, t, cycle, q, dq, None, q, dq)
+        answer = bench.servo.answer(t, reading)
+        bench.servo.tick(t, reading, bench.inbox())
+        assert answer is not None
+        sent = answer.q
+    assert lost > 100
+    assert bench.servo.statistics()["report_error"] < 1.3e-7, "only what single precision rounds"
+    peaks = peaks_of(bench, commanded)
+    assert max(peaks.values()) <= 1.0001, peaks
+    assert math.dist(commanded[0], commanded[-1]) > 0.01
 
 
 @pytest.mark.parametrize("seed", [14, 23, 24])
