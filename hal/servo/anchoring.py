@@ -46,11 +46,13 @@ _ROUNDED = 4e-7
 """A report of the device's own set-point is this exact, rad: an FR3 reports in single precision, and what it continues
 from may be off by another rounding."""
 
-_ROUNDED_STEP = 3e-10
-"""The same for the speed that it reports, as the way of one cycle, rad: at 1 kHz and 2 rad/s two roundings."""
+_ROUNDED_STEP = 1.5e-10
+"""The same for the speed that it reports, as the way of one cycle, rad: at 1 kHz and 2 rad/s."""
 
-_CLOSE = 10.0
-"""A lost set-point is recognised if the reported speed fits it so many times as well as a set-point that was taken."""
+_CLOSE = 1e-8
+"""A lost set-point is recognised if the reported speed fits it to this, as the way of one cycle, rad, or:"""
+_CLOSER = 10.0
+"""so many times as well as a set-point that was taken."""
 
 _AWAY = 1e-2
 """After a silence, an arm this far from its set-point restarts from its measured position, rad (if it does not report
@@ -222,7 +224,8 @@ class Anchoring:
         lost = _continued(self._track, cycles)
         lost_off, lost_step_off = self._distances(q, dq, lost)
         # The speeds distinguish a small loss from none: they are a thousand times as exact as the positions.
-        is_lost = lost_off <= cycles * _ROUNDED and _CLOSE * lost_step_off < step_off
+        close = max(cycles * _CLOSE, step_off / _CLOSER)
+        is_lost = lost_off <= cycles * _ROUNDED and lost_step_off < min(step_off, close)
         self._judge(reading, lost_off if is_lost else off)
         track, count = (lost, cycles) if is_lost else (took, cycles - 1)
         self.lost += count
@@ -230,12 +233,13 @@ class Anchoring:
         if agreed and dq is not None and self._dq is not None:
             track = self._refined(self._track[0] if is_lost else self._motion[0], cycles, int(is_lost), self._dq, dq)
         self._dq = dq if agreed else None
-        if count and self._allows(at := self._state(track)):
-            self._track = track[:3]
+        if count and not self._allows(at := self._state(track)):
+            self._note_taken()
+            return False
+        self._track = track[:3]
+        if count:
             self._smoother.anchor(*at[:3])
-            return True
-        self._note_taken()
-        return False
+        return count > 0
 
     def _refined(self, q: Floats, cycles: int, more: int, before: Floats, dq: Floats) -> list[Floats]:
         """Return where the device was in its last three cycles, newest first, by the speeds that it reports.
