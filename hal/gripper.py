@@ -34,8 +34,9 @@ class Gripper:
     """The gripper of an arm, the same for every driver. The newest command replaces the one before.
 
     ``move``, ``grasp``, ``home``, ``open`` and ``grip`` block until the fingers rest; ``start``, ``start_grasp`` and
-    ``start_home`` return at once, with a :class:`GripperMotion`. Fingers keep what they hold when a session ends or
-    trips.
+    ``start_home`` return at once, with a :class:`GripperMotion`. They need no session, and no dead-man; ``rig.stop()``
+    and the end of the program stop them. What ``control.send(grip=)`` starts stops as soon as that session may not
+    move. In every case fingers keep what they hold.
 
     Every command raises CommandError for values that the gripper cannot do, MotionStopped while ``rig.stop()`` is
     latched, and ConnectionLost. The blocking ones also raise RobotFault, with cause and remedy, if the gripper failed,

@@ -37,7 +37,7 @@ _SAMPLES = 4
 _CUTS = 16
 """A stop is cut at so many times at most to prove that it keeps a margin; a step whose stop needs more is refused."""
 RESERVE = 3e-4
-"""Goals and planned motions stay so much farther away than the margin, m, that a few cuts suffice for a proof."""
+"""Goals stay so much farther away than the margin, m, that a few cuts suffice for a proof."""
 _TOLERANCE = 1e-5
 """Accuracy of distances that are compared, m."""
 _NOWHERE = 1e-12
