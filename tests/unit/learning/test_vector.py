@@ -169,7 +169,7 @@ def test_what_cannot_be_is_refused() -> None:
         ({"processes": 0}, hal.CommandError, "bad_count"),
         ({"autoreset_mode": "never"}, hal.CommandError, "bad_autoreset"),
         ({"unattended": True}, hal.CommandError, "not_simulated"),
-        ({"sim": False}, hal.NotSupported, "not_simulated"),
+        ({"sim": False, "overrides": ("robots.panda.real.host=172.16.0.2",)}, hal.NotSupported, "not_simulated"),
         ({"driver": "mock", "action": "jump"}, hal.CommandError, "unknown_action"),
     ):
         with raises_code(error, code):
