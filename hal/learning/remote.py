@@ -221,7 +221,8 @@ class PolicyClient:
                 raise
         if message.type is aiohttp.WSMsgType.TEXT:
             self._listen()
-            if "Traceback" in message.data:  # the server closes the connection after it
+            # The server closes the connection after it; openpi's sends a traceback.
+            if message.data.startswith(_ERROR) or "Traceback" in message.data:
                 await self._disconnect()
                 raise _server_error(message.data)
             return message.data
@@ -243,6 +244,10 @@ class PolicyClient:
         if session is not None:
             with contextlib.suppress(Exception):
                 await session.close()
+
+
+_ERROR = "Error: "
+"""Begin of the text in which a :class:`PolicyServer` reports an error, in one line."""
 
 
 class PolicyServer:
@@ -341,6 +346,8 @@ class PolicyServer:
 
     async def _serve(self, request: Any) -> Any:
         aiohttp = _aiohttp()
+        if "Origin" in request.headers:  # a page in a browser, of this or of any other site: it cannot leave that out
+            raise aiohttp.web.HTTPForbidden(text="a policy's server answers programs, not pages\n")
         socket = aiohttp.web.WebSocketResponse(compress=False, max_msg_size=LARGEST)
         await socket.prepare(request)
         await socket.send_bytes(pack(self._metadata))
@@ -350,9 +357,9 @@ class PolicyServer:
                     break
                 try:
                     reply = await asyncio.get_running_loop().run_in_executor(None, self._reply, message.data)
-                except Exception:
-                    traceback.print_exc()
-                    await socket.send_str(traceback.format_exc())
+                except Exception as error:
+                    traceback.print_exc()  # for the one who runs the server; the client gets one line
+                    await socket.send_str(_ERROR + f"{type(error).__name__}: {error}".splitlines()[0][:500])
                     await socket.close(code=aiohttp.WSCloseCode.INTERNAL_ERROR)
                     break
                 await (socket.send_str(reply) if isinstance(reply, str) else socket.send_bytes(reply))
@@ -381,7 +388,7 @@ def _aiohttp() -> Any:
 
 def _server_error(text: str) -> PolicyError:
     """Return the error that a server has sent as a text."""
-    last = (text.strip().splitlines() or [""])[-1]
+    last = (text.strip().splitlines() or [""])[-1].removeprefix(_ERROR)
     return PolicyError(f"the policy's server reports: {last[:500]}", code="policy_error")
 
 

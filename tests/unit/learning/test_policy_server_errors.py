@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, NoReturn
 
+import aiohttp
 import numpy as np
 import pytest
 from errors_kit import raises_code
@@ -384,3 +385,21 @@ def test_an_answer_far_into_the_future_is_decoded_only_as_far_as_it_can_be_used(
     outcome = run(rig, lambda request: {"actions": np.ones((5000, 6))}, config=config, seconds=0.1)
     assert outcome.ended == "time"
     assert len(calls) < 60
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:8000", "null"])
+def test_a_page_in_a_browser_is_refused(origin: str) -> None:
+    async def connect(url: str, headers: dict[str, str]) -> str:
+        async with aiohttp.ClientSession() as session, session.ws_connect(url, headers=headers) as socket:
+            await socket.receive_bytes()
+            await socket.send_bytes(pack({"state": np.zeros(2)}))
+            return await socket.receive_str()
+
+    def fail(request: dict[str, object]) -> dict[str, object]:
+        raise ValueError("out of memory\nwith details")
+
+    with PolicyServer(fail) as server:
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            asyncio.run(connect(server.url, {"Origin": origin}))
+        assert refused.value.status == 403
+        assert asyncio.run(connect(server.url, {})) == "Error: ValueError: out of memory"
