@@ -291,13 +291,14 @@ class StopLatch:
     def __init__(self) -> None:
         self.stops = 0
         """Number of calls of :meth:`stop`."""
-        self._acknowledged = 0
+        self.acknowledged = 0
+        """Number of those that are acknowledged."""
         self._lock = threading.RLock()  # a signal handler may call stop() in the middle of stop()
 
     @property
     def stopped(self) -> bool:
         """Whether the newest stop is not acknowledged."""
-        return self._acknowledged < self.stops
+        return self.acknowledged < self.stops
 
     def stop(self) -> None:
         """Latch a stop."""
@@ -307,7 +308,7 @@ class StopLatch:
     def acknowledge(self, stops: int) -> None:
         """Acknowledge the first ``stops`` of all stops; a later one stays latched."""
         with self._lock:
-            self._acknowledged = max(self._acknowledged, stops)
+            self.acknowledged = max(self.acknowledged, stops)
 
     def check(self) -> None:
         """Raise MotionStopped while the stop is not acknowledged."""

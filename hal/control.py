@@ -321,7 +321,7 @@ class Control:
             grip: Grip from 0 (open) to 1 (closed); None leaves the gripper alone.
             width: Distance between the fingers, m, instead of ``grip``.
             gripper: Former name of ``grip``, deprecated.
-            t_event: Time of the pad event behind the command, s, for latency figures; None without one.
+            t_event: Time of the pad event behind the command, s, for latency figures; None or -inf without one.
 
         Returns:
             What was sent, and the reasons for every difference from ``command``.
@@ -343,7 +343,7 @@ class Control:
                 stacklevel=2,
             )
         self._require_open()
-        t_event = 0.0 if t_event is None else number("t_event", t_event, "s")
+        t_event = 0.0 if t_event is None or t_event == -math.inf else number("t_event", t_event, "s")
         servo = self._peek()
         now = self.robot.clock.now()
         self._check_trip(servo, now)
@@ -472,9 +472,10 @@ class Control:
             raise MotionStopped("this session has a dead-man", "release it and press it again", code="deadman_session")
         self._require_open()
         self._host.check()
+        seen = max(self._seen, self.robot._latch.acknowledged)  # rig.rearm() acknowledges every stop before it
         with self._lock:
-            self._publish(self._record._replace(acknowledged=self._seen, rearms=self._record.rearms + 1))
-        self.robot._latch.acknowledge(self._seen)
+            self._publish(self._record._replace(acknowledged=seen, rearms=self._record.rearms + 1))
+        self.robot._latch.acknowledge(seen)
 
     def _finger_width(self, grip: float | None, width: float | None, former: float | None) -> float | None:
         """Return the width in m that ``send`` requests of the gripper, or None; checked before anything is sent."""
