@@ -145,7 +145,7 @@ class TestServed:
                     arm.stops += 1
             arm.drive(arm.dt, tau)
             if arm.servo._at_rest() and arm.servo.report.trip:
-                arm.rearms += 1
+                arm.rearm()
             assert (arm.q <= limits.upper).all()
             assert (arm.q >= limits.lower).all()
             assert np.abs(arm.dq / limits.velocity).max() <= 1.3 * speed  # predicted, so not exact
