@@ -292,7 +292,9 @@ class StopLatch:
         self.stops = 0
         """Number of calls of :meth:`stop`."""
         self.acknowledged = 0
-        """Number of those that are acknowledged."""
+        """Number of those that are acknowledged, for all arms or for one."""
+        self.rearmed = 0
+        """Number of those that :meth:`rearm` acknowledged for all arms."""
         self._lock = threading.RLock()  # a signal handler may call stop() in the middle of stop()
 
     @property
@@ -306,9 +308,14 @@ class StopLatch:
             self.stops += 1
 
     def acknowledge(self, stops: int) -> None:
-        """Acknowledge the first ``stops`` of all stops; a later one stays latched."""
+        """Acknowledge the first ``stops`` of all stops in the session of one arm; a later one stays latched."""
         with self._lock:
             self.acknowledged = max(self.acknowledged, stops)
+
+    def rearm(self) -> None:
+        """Acknowledge every stop so far, for all arms."""
+        with self._lock:
+            self.acknowledged = self.rearmed = self.stops
 
     def check(self) -> None:
         """Raise MotionStopped while the stop is not acknowledged."""

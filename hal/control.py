@@ -472,7 +472,7 @@ class Control:
             raise MotionStopped("this session has a dead-man", "release it and press it again", code="deadman_session")
         self._require_open()
         self._host.check()
-        seen = max(self._seen, self.robot._latch.acknowledged)  # rig.rearm() acknowledges every stop before it
+        seen = max(self._seen, self.robot._latch.rearmed)  # rig.rearm() acknowledges every stop before it
         with self._lock:
             self._publish(self._record._replace(acknowledged=seen, rearms=self._record.rearms + 1))
         self.robot._latch.acknowledge(seen)

@@ -418,7 +418,7 @@ class Rig:
 
         A session that is open stays stopped: it is continued by ``control.rearm()``, or by its dead-man.
         """
-        self._latch.acknowledge(self._latch.stops)
+        self._latch.rearm()
 
     def _world_edited(self, host: Host, method: str, params: dict[str, Any], revision: int) -> None:
         if method == "add":

@@ -74,12 +74,13 @@ class FrankaHand(GripperDriver):
 
     def read(self, now: float) -> GripperReading:
         """Return the newest state. Raises ConnectionLost when the hand has sent none for a second."""
+        offset = now - time.monotonic()  # before what follows, which may take some time
         self._process_events()
         state = self._fresh_state()
         controller = self._controller
         running = controller.outcome is GripperOutcome.RUNNING
         return GripperReading(
-            t=now - (time.monotonic() - state.t),
+            t=state.t + offset,
             t_device=state.t_hand,
             seq=self._seq,
             width=state.width,

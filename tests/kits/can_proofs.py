@@ -28,6 +28,7 @@ __all__ = ["WAYS", "End", "Rest", "Tour", "end", "rest", "tour", "tracking"]
 _TELEOP = Path(__file__).resolve().parents[2] / "apps" / "teleop.py"
 SPEED = 0.4
 """Of the joint that moves when a program ends, rad/s."""
+_NO_TABLE = ("robots.arm.workspace=null", "collisions.boxes=[]")
 WAYS = ("app killed", "host killed", "bus cut")
 
 APP = """
@@ -72,7 +73,7 @@ def rest(
     """
     found = []
     with (
-        EmulatorProcess(rig_name, "robots.arm.workspace=null", *more) as emulator,
+        EmulatorProcess(rig_name, *_NO_TABLE, *more) as emulator,
         hal.open(rig_name, sim=False, pad="none", overrides=emulator.overrides) as rig,
     ):
         arm = rig.robots["arm"]
@@ -130,7 +131,7 @@ def tour(rig_name: str, pad: Path, folder: Path) -> Tour:
 def tracking(rig_name: str, seconds: float = 8.0) -> list[float]:
     """Return distances between the set-point's tcp and the plant's at the same time, m, in a motion of all axes."""
     with (
-        EmulatorProcess(rig_name, "robots.arm.workspace=null") as emulator,
+        EmulatorProcess(rig_name, *_NO_TABLE) as emulator,
         hal.open(rig_name, sim=False, pad="none", overrides=emulator.overrides) as rig,
     ):
         arm = rig.robots["arm"]

@@ -206,7 +206,7 @@ def fault_parameter(fault: CanFault) -> Any:
     return pytest.param(fault, id=fault.name.replace(" ", "_"), marks=[pytest.mark.slow] if slow else [])
 
 
-@pytest.mark.parametrize("fault", map(fault_parameter, FAULTS))
+@pytest.mark.parametrize("fault", [fault_parameter(fault) for fault in FAULTS])
 def test_a_fault_in_motion(fault: CanFault) -> None:
     with driven() as arm:
         began = arm.clock.now()

@@ -143,3 +143,22 @@ def test_a_press_for_another_trip_never_clears_a_stop(rig: hal.Rig, arm: hal.Rob
         assert control.trip is (Trip.FAULT if cause == "robot_fault" else Trip.STOP)
         causes.end(cause)
         assert_stopped(rig, control, press_again)
+
+
+def test_the_rearm_of_one_arm_acknowledges_no_stop_for_another() -> None:
+    robots = {name: {"model": "panda", "base": {"position": [0, y, 0]}} for name, y in (("a", 0.0), ("b", 2.0))}
+    with (
+        hal.open({"robots": robots}, driver="mock", clock="lock_step", pad="none") as rig,
+        rig.robots["a"].control(rate_hz=50) as seeing,
+        rig.robots["b"].control(rate_hz=50) as other,
+    ):
+        rig.stop()
+        with raises_code(MotionStopped, "rig_stop"):
+            drive(rig, seeing)
+        seeing.rearm()
+        drive(rig, seeing)
+        other.rearm()  # its caller has not seen the stop
+        with raises_code(MotionStopped, "rig_stop"):
+            drive(rig, other)
+        other.rearm()
+        drive(rig, other)
