@@ -84,6 +84,7 @@ LOSSES = (
 """More than what a cable loses, but no 20 set-points in a row: only these are a fault, by the robot's own rule."""
 
 
+@pytest.mark.timeout(60 + 30 * RUNS)
 @pytest.mark.parametrize("stream", ["position", "velocity", "torque"])
 @pytest.mark.parametrize("robot", ["fr3", "panda"])
 def test_packets_that_are_lost_end_no_motion(emulator: Emulator, robot: str, stream: str) -> None:
