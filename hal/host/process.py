@@ -28,6 +28,7 @@ from typing import Any
 from .. import errors
 from ..errors import ConnectionLost, HalError, NotSupported, Problem
 from ..lock import APP_MARK
+from . import records
 
 __all__ = [
     "Channel",
@@ -42,10 +43,12 @@ __all__ = [
 ]
 
 _BOOT = (
-    "import sys, json; fds, path, target = json.loads(sys.argv[1]); "
-    "sys.path.extend(p for p in path if p not in sys.path); "
-    "from hal.host.process import child_main; child_main(target, fds)"
+    "import sys, json, site; fds, path, target, library = json.loads(sys.argv[1]); "
+    "sys.path += [p for p in path if p not in sys.path]; site.main(); "
+    "from hal.host.process import child_main; child_main(target, fds, library)"
 )
+"""Program of a child: Python's own modules come first, then the app's path in its order, then what ``site`` adds."""
+_OPTIONS = ("-I", "-S", "-u", "-c")
 START_TIMEOUT = 60.0
 """Longest time that a child may take to get ready, s: reading a large mesh for the first time takes a while."""
 REQUEST_TIMEOUT = 30.0
@@ -56,6 +59,11 @@ _SLICE = 0.2
 """s that a thread waits for an answer before it checks that the child is alive."""
 _IDLE = 0.5
 """s that :func:`serve` waits for a message before it checks that the app is alive."""
+
+
+def _library() -> tuple[str, int]:
+    """Return which copy of this library a process runs: its folder, and the layout of its shared memory."""
+    return os.path.realpath(os.path.dirname(errors.__file__)), records.LAYOUT
 
 
 class ChannelClosed(ConnectionLost):
@@ -236,7 +244,7 @@ class Child:
         fds = [theirs.fileno(), *(memory.fd for memory in memories)]
         path = [os.path.abspath(entry) for entry in sys.path]
         self.process = subprocess.Popen(
-            [sys.executable, "-I", "-u", "-c", _BOOT, json.dumps([fds, path, target]), f"{APP_MARK}{os.getpid()}"],
+            [sys.executable, *_OPTIONS, _BOOT, json.dumps([fds, path, target, _library()]), f"{APP_MARK}{os.getpid()}"],
             pass_fds=fds,
             stdin=subprocess.DEVNULL,
             stdout=self._log,
@@ -462,16 +470,22 @@ def _serve_message(
         channel.send({"id": number, **answer}, timeout)
 
 
-def child_main(target: str, fds: Sequence[int]) -> None:
+def child_main(target: str, fds: Sequence[int], library: Sequence[Any]) -> None:
     """Run a child: call the target, report an error that it raises, end without interpreter tear-down.
 
     Args:
         target: ``module:function``.
         fds: Descriptors of the socket and of the memories.
+        library: The app's copy of this library; another one is refused.
     """
     channel = Channel(socket.socket(fileno=fds[0]))
     status = 0
     try:
+        own = _library()
+        if own != tuple(library):
+            folders = f"the app runs {library[0]}, this process {own[0]}"
+            changed = folders if own[0] != library[0] else f"{own[0]} has changed since the app started"
+            raise NotSupported(f"app and servo must be one copy of hal: {changed}", code="version_mismatch")
         memories = [SharedMemory(fd=fd) for fd in fds[1:]]
         config = channel.receive(START_TIMEOUT)
         module, _, function = target.partition(":")

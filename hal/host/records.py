@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from math import isnan, nan
 from typing import TYPE_CHECKING, Any, NamedTuple
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ __all__ = [
     "GripperRecord",
     "GroupMemory",
     "HostRecord",
+    "LAYOUT",
     "RobotMail",
     "ServoRecord",
     "StateLayout",
@@ -503,3 +505,10 @@ class GroupMemory:
 
 def _names(spec: GroupSpec) -> tuple[list[tuple[str, int]], list[str]]:
     return [(robot.name, len(robot.joints)) for robot in spec.robots], [gripper.name for gripper in spec.grippers]
+
+
+_RECORDS = (AppRecord, DeadmanRecord, GripperCommand, HostRecord, ServoRecord, SessionRecord)
+_NUMBERS = (ControlMode, GripperAct, GripperOutcome, Kind, Limited, RobotStatus, Trip)
+_FORMATS = (_APP, _HOST, _GRIPPER_COMMAND, _GRIPPER_STATE, GRIPPER_STATES, *RobotMail.layouts(7), _chunk_capacity(7))
+LAYOUT = crc32(repr((_FORMATS, [record._fields for record in _RECORDS], [list(kind) for kind in _NUMBERS])).encode())
+"""Number for the layout of all mailboxes: processes in which it differs must not share memory."""

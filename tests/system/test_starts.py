@@ -2,12 +2,15 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+
+import hal
 
 pytestmark = pytest.mark.slow
 
@@ -89,3 +92,29 @@ for _ in range(2):
         print(a.clock.now() < b.clock.now(), a.robots["panda"].n)
 """
     assert run(["-c", program], None, tmp_path).split() == ["True", "7"] * 2
+
+
+@pytest.mark.parametrize("change", ["none", "path", "upgrade"])
+def test_the_servo_runs_the_copy_of_the_library_that_the_app_runs(tmp_path: Path, change: str) -> None:
+    """Another copy than the installed one, by PYTHONPATH; a servo that cannot run the same code is refused."""
+    installed = Path(hal.__file__).parent
+    copy = shutil.copytree(installed, tmp_path / "hal", ignore=shutil.ignore_patterns("__pycache__"))
+    other_layout = f"with open({str(copy / 'host' / 'records.py')!r}, 'a') as file: file.write('LAYOUT += 1\\n')\n"
+    if change == "none":
+        exec(other_layout)  # the installed copy would be refused
+    program = "import hal, sys, hal.host.records\n"
+    program += {"none": "", "path": f"sys.path.remove({str(tmp_path)!r})\n", "upgrade": other_layout}[change]
+    program += "try:\n    rig = hal.open('panda_table', sim=True, pad='none', overrides=['cameras={}'])\n"
+    program += "except hal.NotSupported as error: print(error.code, error)\nelse: rig.close(); print('opened')\n"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path.parent,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    told = {"none": "opened", "path": "version_mismatch", "upgrade": "version_mismatch"}[change]
+    assert done.stdout.startswith(told), done.stdout + done.stderr
+    if change != "none":
+        assert str(copy) in done.stdout
