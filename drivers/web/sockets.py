@@ -46,6 +46,8 @@ _UNSENT_BYTES = 16384
 """Bytes that the kernel keeps for a page that does not read. More would only grow old there."""
 _MAX_CONNECTIONS = 128
 """Connections that are not a page's socket. Sixteen pages that load at the same time have 96."""
+_MAX_REQUESTS = 100
+"""Requests that one of them may send in one second. A page needs a dozen."""
 _IDLE_TIME = 5.0
 """Time for which such a connection stays without a whole request, in s."""
 _RETRY_AFTER = 0.1
@@ -53,9 +55,11 @@ _RETRY_AFTER = 0.1
 
 
 class RateLimit:
-    """Counts the messages of one socket."""
+    """Counts the messages of one socket, or the requests of one connection."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = MAX_MESSAGES) -> None:
+        """Allow ``most`` messages in one second."""
+        self._most = most
         self._second = 0.0
         self._messages = 0
         self._malformed = 0
@@ -65,7 +69,7 @@ class RateLimit:
         if not 0.0 <= now - self._second < 1.0:
             self._second, self._messages = now, 0
         self._messages += 1
-        return self._messages <= MAX_MESSAGES
+        return self._messages <= self._most
 
     def allows_malformed(self) -> bool:
         """Count a malformed message; False if there were too many."""
@@ -84,8 +88,8 @@ class ConnectionLimit:
         """``most`` connections at the same time, each for ``idle_time`` s without a request."""
         self._most = most
         self._idle_time = idle_time
-        self._since: dict[asyncio.Transport, float] = {}
-        """Time of the connection or of its last request, s, monotonic; the oldest first."""
+        self._since: dict[asyncio.Transport, tuple[float, RateLimit]] = {}
+        """Time of the connection or of its last request, s, monotonic, and its requests; the oldest first."""
 
     async def accept_all(self, sock: socket.socket, server: Callable[[], asyncio.Protocol]) -> None:
         """Accept connections to ``sock`` until cancelled.
@@ -113,12 +117,14 @@ class ConnectionLimit:
                 del self._since[known]
         if len(self._since) >= self._most:
             self._abort_oldest()
-        self._since[transport] = now
+        self._since[transport] = now, RateLimit(_MAX_REQUESTS)
 
     def note_request(self, transport: asyncio.BaseTransport | None, now: float) -> None:
-        """Note that a connection has sent the headers of a request at ``now`` (s, monotonic)."""
-        if isinstance(transport, asyncio.Transport) and self._since.pop(transport, None) is not None:
-            self._since[transport] = now
+        """Note that a connection has sent a request at ``now`` (s, monotonic), and abort it after too many."""
+        if isinstance(transport, asyncio.Transport) and (known := self._since.pop(transport, None)) is not None:
+            self._since[transport] = now, known[1]
+            if not known[1].allows_message(now):
+                transport.abort()
 
     @contextlib.contextmanager
     def exempt(self, transport: asyncio.Transport) -> Iterator[None]:
@@ -127,11 +133,11 @@ class ConnectionLimit:
         try:
             yield
         finally:
-            self._since[transport] = time.monotonic()
+            self._add(transport, time.monotonic())
 
     def close_idle(self, now: float) -> None:
         """Abort the connections that were idle for too long at ``now`` (s, monotonic); to be called regularly."""
-        while self._since and now - next(iter(self._since.values())) > self._idle_time:
+        while self._since and now - next(iter(self._since.values()))[0] > self._idle_time:
             self._abort_oldest()
 
     def _abort_oldest(self) -> None:
