@@ -86,6 +86,7 @@ class SharedMemory:
 
     def __init__(self, size: int = 0, fd: int | None = None) -> None:
         """Create ``size`` bytes, or map those behind the descriptor ``fd``."""
+        self._owner = os.getpid() if fd is None else 0
         if fd is None:
             fill_standard_descriptors()
             fd = self._create()
@@ -103,8 +104,10 @@ class SharedMemory:
             return os.dup(file.fileno())
 
     def close(self) -> None:
-        """Close the descriptor. The map is freed with the last view of it."""
+        """Close the descriptor; the process that created the memory frees it, and every view then reads zeros."""
         if self.fd >= 0:
+            if self._owner == os.getpid() and hasattr(mmap, "MADV_REMOVE"):  # the map itself ends with the last view
+                self._map.madvise(mmap.MADV_REMOVE)
             os.close(self.fd)
             self.fd = -1
 

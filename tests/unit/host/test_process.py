@@ -196,6 +196,20 @@ def test_starts_from_anywhere_also_beside_files_that_shadow_the_library(tmp_path
     assert done.stdout.strip() == "fine", done.stderr
 
 
+def test_memory_is_freed_by_the_process_that_created_it_and_by_no_other() -> None:
+    memory = SharedMemory(1 << 20)
+    other = SharedMemory(fd=os.dup(memory.fd))
+    memory.buffer[:] = b"1" * memory.size
+    other.close()
+    if (pid := os.fork()) == 0:
+        memory.close()
+        os._exit(0)
+    os.waitpid(pid, 0)
+    assert bytes(memory.buffer[:2]) == b"11"
+    memory.close()
+    assert bytes(memory.buffer[:2]) == bytes(2), "its pages are given back, though views of it are left"
+
+
 def test_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     """Nothing is left, though nobody could clean up."""
     program = PROGRAM.format(here=str(HERE)).replace("child.close()", "print(child.process.pid, flush=True); input()")
