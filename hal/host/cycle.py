@@ -41,6 +41,8 @@ __all__ = [
 
 TCP_APART, TCP_TURNED = 0.002, 0.02
 """Largest distance of a device's own tcp from the model's, m and rad."""
+_SHARE = 0.3
+"""Share of a cycle for which a long path is checked before the next cycle."""
 ENGAGE_LIMIT = 1.0
 """Longest time for switching an arm's drives on, s."""
 FRESH = 0.02
@@ -273,13 +275,14 @@ class ArmUnit:
 
     # Requests.
 
-    def open_session(self, session: Session, app: AppRecord, turn: Callable[[], None]) -> None:
+    def open_session(self, session: Session, app: AppRecord, turn: Callable[[], None], paced: bool = False) -> None:
         """Open a control session. The arm's drives are switched on first.
 
         Args:
             session: The terms of the session.
             app: The app's newest record.
             turn: Runs one whole cycle of the group, so that its other devices continue meanwhile.
+            paced: Whether ``turn`` waits for its time: then a long path is checked between the cycles.
 
         Raises:
             ControlTaken: While another one is open.
@@ -294,7 +297,16 @@ class ArmUnit:
         if said.session != session.id:
             return  # the app gave up while this request was on its way
         self._anchor()
-        self.servo.open_session(session, self._inbox(app, said))
+        began = time.monotonic()
+
+        def pause() -> None:
+            nonlocal began
+            if paced and time.monotonic() - began > _SHARE * self.dt:
+                turn()
+                self._anchor()
+                began = time.monotonic()
+
+        self.servo.open_session(session, self._inbox(app, said), pause)
         self._session = session.id
 
     def _engage(self, turn: Callable[[], None]) -> None:
@@ -493,7 +505,8 @@ class Cycle:
         return self.arms[robot]
 
     def _do_begin(self, robot: str, session: list[Any]) -> None:
-        self._arm(robot).open_session(Session.unpack(session), self.memory.get_app(), self.turn)
+        paced = self.spec.clock != "lock_step"
+        self._arm(robot).open_session(Session.unpack(session), self.memory.get_app(), self.turn, paced)
 
     def _do_gains(self, robot: str, session: int, controller: dict[str, Any]) -> None:
         self._arm(robot).servo.set_gains(session, controller_of(controller))

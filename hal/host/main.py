@@ -369,7 +369,8 @@ class HostProcess:
         if self.pace.pausing:
             self.cycle.publish(self.pace.now())  # the request may have changed the state
         self._answer(message["id"], answer)
-        self.pace.restart()
+        if method.startswith("world."):
+            self.pace.restart()  # the world stood still, and its arms with it
 
     def _answer(self, number: int, answer: dict[str, Any]) -> None:
         try:

@@ -16,7 +16,7 @@ border to the next, where a is 0. So wherever the arm stops on the path, a plan 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import sqrt
 from typing import NamedTuple
 
@@ -148,7 +148,14 @@ class Zone(NamedTuple):
     """Greatest v at the end from which the rest of the section can be passed within its limits."""
 
 
-def zones_of(path: JointPath, limits: LimitsSpec, velocity: Floats, tcp_speed: float, arm: Kinematics) -> list[Zone]:
+def zones_of(
+    path: JointPath,
+    limits: LimitsSpec,
+    velocity: Floats,
+    tcp_speed: float,
+    arm: Kinematics,
+    pause: Callable[[], None] = lambda: None,
+) -> list[Zone]:
     """Return the zones of a section, from its start to its end.
 
     Args:
@@ -157,6 +164,7 @@ def zones_of(path: JointPath, limits: LimitsSpec, velocity: Floats, tcp_speed: f
         velocity: Greatest speeds of the joints (n,), rad/s.
         tcp_speed: Greatest speed of the tcp, m/s; infinite for none.
         arm: The arm's kinematics.
+        pause: Called again and again during the computation.
     """
     rates, curves, third = (np.maximum(bound, _TINY) for bound in path.bounds())
     first, second = rates.max(axis=0), curves.max(axis=0)
@@ -164,8 +172,8 @@ def zones_of(path: JointPath, limits: LimitsSpec, velocity: Floats, tcp_speed: f
     bends = np.sqrt(_CURVE_ACCELERATION * A / second)
     most = np.minimum(np.minimum(np.asarray(velocity) / first, np.cbrt(_CURVE_JERK * J / third)), bends).min(axis=1)
     if tcp_speed < np.inf:
-        most = np.minimum(most, tcp_speed / np.maximum(_tcp_rates(path, arm), _TINY))
-    squares = _fastest(np.square(most), rates / (2.0 * np.diff(path.s)[:, None]), curves, A)
+        most = np.minimum(most, tcp_speed / np.maximum(_tcp_rates(path, arm, pause), _TINY))
+    squares = _fastest(np.square(most), rates / (2.0 * np.diff(path.s)[:, None]), curves, A, pause)
     v = np.sqrt(squares)
     left = A - curves * squares[:, None]
     mixed = (_MIXED_JERK * J / (3.0 * second)).min(axis=1) / v
@@ -183,7 +191,7 @@ def zones_of(path: JointPath, limits: LimitsSpec, velocity: Floats, tcp_speed: f
     return zones[::-1]
 
 
-def _fastest(most: Array, rates: Array, curves: Array, A: Array) -> Array:
+def _fastest(most: Array, rates: Array, curves: Array, A: Array, pause: Callable[[], None]) -> Array:
     """Return the greatest v^2 between two knots (k - 1,) from rest to rest, without a limit of jerk.
 
     With x = v^2, a is the change of x over twice the way (as in Pham and Pham, "A New Approach to Time-Optimal Path
@@ -194,9 +202,10 @@ def _fastest(most: Array, rates: Array, curves: Array, A: Array) -> Array:
         rates: Bounds of q' and -q' over twice the way between two knots (2, k - 1, n).
         curves: Bounds of q'' and -q'' (2, k - 1, n).
         A: Greatest accelerations (n,).
+        pause: Called again and again.
     """
-    forward = _from_rest(most, rates, curves, A)
-    backward = _from_rest(most[::-1], rates[::-1, ::-1], curves[:, ::-1], A)[::-1]
+    forward = _from_rest(most, rates, curves, A, pause)
+    backward = _from_rest(most[::-1], rates[::-1, ::-1], curves[:, ::-1], A, pause)[::-1]
     ends = np.minimum(forward, backward)
     # Between two knots x rises from both until the two lines meet, above their mean.
     rates = 2.0 * rates.max(axis=0)
@@ -205,21 +214,26 @@ def _fastest(most: Array, rates: Array, curves: Array, A: Array) -> Array:
     return greatest
 
 
-def _from_rest(most: Array, rates: Array, curves: Array, A: Array) -> Array:
+def _from_rest(most: Array, rates: Array, curves: Array, A: Array, pause: Callable[[], None]) -> Array:
     """Return the greatest x at knots (k,), 0 at the first: rates (y - x) + curves y <= A from each x to the next, y."""
     free, share = A / (rates + curves), rates / (rates + curves)
     x = [0.0]
     for k, limit in enumerate(most.tolist()):
         x.append(min(limit, float((free[:, k] + share[:, k] * x[k]).min())))
+        pause()
     return np.array(x)
 
 
-def _tcp_rates(path: JointPath, arm: Kinematics) -> Array:
+def _tcp_rates(path: JointPath, arm: Kinematics, pause: Callable[[], None]) -> Array:
     """Return the greatest way of the tcp for each unit of s (k - 1,), m, between two knots."""
     s = path.s
     middles = 0.5 * (s[1:] + s[:-1])
-    at = [path.at(x) for x in (*s.tolist(), *middles.tolist())]
-    rates = np.array([np.linalg.norm(arm.jacobian(q)[:3].dot(first)) for q, first, _ in at])
+    found = []
+    for x in (*s.tolist(), *middles.tolist()):
+        q, first, _ = path.at(x)
+        found.append(np.linalg.norm(arm.jacobian(q)[:3].dot(first)))
+        pause()
+    rates = np.array(found)
     ends, inside = rates[: len(s)], rates[len(s) :]
     greatest = np.maximum(np.maximum(ends[1:], ends[:-1]), inside)
     # A parabola through three values is no higher than this.

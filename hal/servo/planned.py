@@ -6,7 +6,7 @@ limits. Stops are made on the path wherever that is possible, and a motion that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import dist, inf, isfinite
 
@@ -84,11 +84,12 @@ class PlannedMotion(ServoMotion):
             return 1.0 if self.arrived else 0.0
         return min(1.0, (self._before[self._section] + self._s) / self._before[-1])
 
-    def set_path(self, sections: Sequence[PathSection]) -> None:
+    def set_path(self, sections: Sequence[PathSection], pause: Callable[[], None] = lambda: None) -> None:
         """Set the path.
 
         Args:
             sections: The path, from where the set-point is.
+            pause: Called again and again during the checks, which take a third of a millisecond for each knot.
 
         Raises:
             CommandError: The path is malformed (``code`` is ``bad_path``), longer than :data:`.PATH_KNOTS` knots
@@ -102,9 +103,12 @@ class PlannedMotion(ServoMotion):
             raise CommandError(
                 f"the path starts {away:.3f} rad from the arm, which has moved since it was planned", code="start_moved"
             )
-        paths = [JointPath(section) for section in sections]
-        self._check_limits(paths)
-        self._check_workspace(paths)
+        paths = []
+        for section in sections:
+            paths.append(JointPath(section))
+            pause()
+        self._check_limits(paths, pause)
+        self._check_workspace(paths, pause)
         tcp_speed = _TCP_SHARE * envelope.tcp_speed if envelope.tcp_speed < UNLIMITED else inf
         limits = LimitsSpec(
             tuple(smoother.lower),
@@ -113,7 +117,8 @@ class PlannedMotion(ServoMotion):
             tuple(smoother.acceleration),
             tuple(smoother.jerk),
         )
-        plan = [(path, zones_of(path, limits, envelope.velocity, tcp_speed, envelope.kinematics)) for path in paths]
+        velocity, arm = list(envelope.velocity), envelope.kinematics
+        plan = [(path, zones_of(path, limits, velocity, tcp_speed, arm, pause)) for path in paths]
         if not all(min(zone.speed, zone.acceleration, zone.braking, zone.jerk) > 0.0 for _, z in plan for zone in z):
             raise CommandError("the path has a part that no speed is slow enough for", code="bad_path")
         self._sections = plan
@@ -301,20 +306,21 @@ class PlannedMotion(ServoMotion):
         if not sections or not joined:
             raise CommandError("each section of a path must begin where the one before ends", code="bad_path")
 
-    def _check_limits(self, paths: Sequence[JointPath]) -> None:
+    def _check_limits(self, paths: Sequence[JointPath], pause: Callable[[], None]) -> None:
         """Raise CommandError unless all joints stay inside their limits, or only come back in."""
         smoother = self.smoother
         start = paths[0].q[0].tolist()
         lowest = [min(low, x) - 1e-6 for low, x in zip(smoother.lower, start, strict=True)]
         highest = [max(high, x) + 1e-6 for high, x in zip(smoother.upper, start, strict=True)]
         for path in paths:
+            pause()
             q = path.samples(_SAMPLES)
             outside = ((q < lowest) | (q > highest)).any(axis=0)
             if outside.any():
                 joints = ", ".join(str(k) for k in outside.nonzero()[0].tolist())
                 raise CommandError(f"the path leaves the position limits of joint {joints}", code="joint_limit")
 
-    def _check_workspace(self, paths: Sequence[JointPath]) -> None:
+    def _check_workspace(self, paths: Sequence[JointPath], pause: Callable[[], None]) -> None:
         """Raise CommandError unless the tcp stays inside the workspace, or only comes back in."""
         box = self.envelope.workspace
         if box is None:
@@ -323,6 +329,7 @@ class PlannedMotion(ServoMotion):
         begun = fk(self.smoother.q)
         for path in paths:
             for q in path.samples(2).tolist():
+                pause()
                 for x, x0, low, high, axis in zip(fk(q), begun, box.lower, box.upper, "xyz", strict=False):
                     if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
                         raise CommandError(

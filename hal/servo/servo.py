@@ -9,7 +9,7 @@ that must not follow is brought to rest by the smoother's time-optimal stop and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import dist, hypot, isfinite
 from typing import Any
 
@@ -176,12 +176,13 @@ class Servo:
         self._forget_goals()
         self._publish()
 
-    def open_session(self, session: Session, inbox: Inbox) -> None:
+    def open_session(self, session: Session, inbox: Inbox, pause: Callable[[], None] = lambda: None) -> None:
         """Open a control session; the servo must have been anchored.
 
         Args:
             session: The terms of the session.
             inbox: Its present content: presses and rearms in it do not count.
+            pause: Called again and again while a long path is checked; it may run ticks, and anchor the servo.
 
         Raises:
             ControlTaken: While another session is open.
@@ -196,7 +197,7 @@ class Servo:
         self._compliance.open_session(session)
         self._whole = None
         if session.path is not None:
-            self._planned.set_path(session.path)
+            self._planned.set_path(session.path, pause)
             self._whole = self._planned
         elif session.move_to is not None:
             self._path.set_goal(session.move_to)

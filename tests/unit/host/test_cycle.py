@@ -10,7 +10,7 @@ from drives import ArmWithDrives
 from specs import panda
 
 from hal import registry
-from hal.commands import CommandRecord, Kind, Session, SessionRecord
+from hal.commands import CommandRecord, Kind, PathSection, Session, SessionRecord
 from hal.errors import ConnectionLost, RobotFault
 from hal.geometry import Pose
 from hal.host.cycle import LOWER_LIMIT, TCP_APART, TCP_TURNED, ArmUnit, Cycle
@@ -142,9 +142,10 @@ class TwoArms:
             arm.mail.put_command(CommandRecord(self.seq, 1, now, now + 0.1, Kind.JOINT_VELOCITY, velocity))
         self.cycle.step(now, AppRecord(now, 0))
 
-    def begin(self, name: str) -> None:
+    def begin(self, name: str, path: tuple[PathSection, ...] | None = None) -> None:
         self.cycle.arms[name].mail.put_session(SessionRecord(1, 0, 0))
-        self.cycle.request("begin", {"robot": name, "session": list(Session(1, 1.0, 100.0, False))})
+        session = Session(1, 1.0, 100.0, False, path=path)
+        self.cycle.request("begin", {"robot": name, "session": list(session)})
 
     def drive(self, arm: ArmUnit) -> None:
         """Run cycles until the arm follows its commands."""
@@ -164,6 +165,25 @@ def test_another_arm_of_the_group_moves_on_while_drives_are_switched_on(monkeypa
     assert len(arms.left.driver.log) == written + taken
     arms.drive(arms.right)
     assert arms.left.servo.report.trip is Trip.NONE
+
+
+def test_another_arm_of_the_group_moves_on_while_a_long_path_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hal.host.cycle._SHARE", 0.0)  # as if each piece of the work took so long
+    arms = TwoArms(monkeypatch)
+    arms.begin("left")
+    arms.drive(arms.left)
+    knots, start = 100, arms.right.spec.initial
+    q = tuple((start[0] + 1e-3 * k, *start[1:]) for k in range(knots))
+    path = (PathSection(tuple(map(float, range(knots))), q),)
+    ticks, written = arms.cycle.ticks, len(arms.left.driver.log)
+    arms.begin("right", path)
+    taken = arms.cycle.ticks - ticks
+    assert taken > knots
+    assert len(arms.left.driver.log) == written + taken
+    assert arms.left.servo.report.trip is Trip.NONE
+    for _ in range(200):
+        arms.turn()
+    assert arms.right.servo.report.progress > 0.01
 
 
 def test_a_session_begins_where_the_arm_is_once_its_drives_are_on(monkeypatch: pytest.MonkeyPatch) -> None:
