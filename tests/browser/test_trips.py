@@ -118,6 +118,32 @@ def test_stop_by_the_person_who_drives(bench: Bench, moving: Browser) -> None:
     goes_on_after_release_and_press(bench, moving)
 
 
+AGAIN, CONTINUE = "Release everything, then hold Space again.", "Hold Space to continue."
+
+
+@pytest.mark.parametrize("trip", ["stop", "deadman_lost"])
+def test_the_page_says_one_thing_to_do_and_it_works(bench: Bench, moving: Browser, trip: str) -> None:
+    """Space and an arrow stay held during the trip."""
+    if trip == "stop":
+        moving.tap("Escape", "Escape")
+    else:
+        moving.run("window.dispatchEvent(new Event('blur')); window.dispatchEvent(new Event('focus'))")
+    wait_for(lambda: bench.trip == trip and bench.rests(), "the trip")
+
+    def says(text: str, button: str) -> bool:
+        shown = [moving.text(part) for part in ("#waiting", "#trip-remedy", "#hold b")]
+        return shown == [text, text, button]
+
+    if trip == "stop":  # after the other one the page has released everything by itself
+        wait_for(lambda: says(AGAIN, "RELEASE"), "one instruction")
+        assert not moving.text("#hold-keys")
+    moving.key("ArrowLeft", "ArrowLeft", False)
+    moving.let_go()
+    wait_for(lambda: says(CONTINUE, "HOLD TO MOVE"), "the next one")
+    move(bench, moving)
+    wait_for(lambda: moving.text("#hold b") == "HELD" and not moving.text("#trip-text"), "nothing more to do")
+
+
 def test_the_stop_button(bench: Bench, moving: Browser) -> None:
     stops_for(bench, moving, "stop", lambda: moving.click("#stop"))
     goes_on_after_release_and_press(bench, moving)

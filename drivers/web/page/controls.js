@@ -147,6 +147,8 @@ export class Controls {
     this.source = pad.source();
     /** Names of what holds the dead-man, besides the button on the page. */
     this.holdKeys = () => "Space";
+    /** Whether what is held moves nothing until it was released. */
+    this.mustRelease = false;
     this.hold = byId("hold");
     this.home = byId("home");
     this.slider = new Slider(byId("gripper"), enabled, () => pad.grip, (place) => pad.setGrip(place));
@@ -296,8 +298,8 @@ export class Controls {
     this.slider.show(this.pad.deadman === "r2" ? 0 : axes[AXIS.r2]);
     setData(this.hold, "pressed", held ? "" : null);
     setAttribute(this.hold, "aria-pressed", String(held));
-    setText(/** @type {Element} */ (this.hold.querySelector("b")), held ? "HELD" : "HOLD TO MOVE");
-    setText(byId("hold-keys"), held ? "Release to stop" : this.holdKeys());
+    setText(/** @type {Element} */ (this.hold.querySelector("b")), !held ? "HOLD TO MOVE" : this.mustRelease ? "RELEASE" : "HELD");
+    setText(byId("hold-keys"), !held ? this.holdKeys() : this.mustRelease ? "" : "Release to stop");
     setAttribute(this.home, "aria-disabled", String(!held));
     const homing = this.pad.home !== null && (mask & BIT[this.pad.home]) !== 0;
     setData(this.home, "pressed", homing ? "" : null);

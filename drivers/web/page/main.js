@@ -131,6 +131,10 @@ function paintSettings() {
 
 function advise() {
   status.advise(presence.present, pad.held, pad.pushed, state?.playing ?? false);
+  if (controls.mustRelease !== status.mustRelease) {
+    controls.mustRelease = status.mustRelease;
+    controls.paint();
+  }
 }
 
 function retitle() {

@@ -45,6 +45,8 @@ export class Status {
     this.status = "unknown";
     this.moving = false;
     this.trip = "none";
+    /** Whether this page's pad holds the dead-man. */
+    this.held = false;
     /** Name of what is held: "Space", "L2" or "the button". */
     this.holdName = () => "Space";
     byId("recover").addEventListener("click", () => connection.send({ type: "recover", robot: this.faulty }));
@@ -141,9 +143,22 @@ export class Status {
   /** Return what to do after a trip. */
   #remedy() {
     if (!this.lease.mine) return "The page in control can continue.";
-    const again = this.deadman === "held" ? `release ${this.holdName()}, then hold it again` : `hold ${this.holdName()} to continue`;
-    if (this.trip === "device_lost") return `When the robot answers again, ${again}.`;
-    return `${sentence(again)}.`;
+    return this.trip === "device_lost" ? `When the robot answers again: ${this.#resume()}` : this.#resume();
+  }
+
+  /** Whether the dead-man counts only after everything was released. */
+  get mustRelease() {
+    const stopped = this.trip !== "none" || this.faulty !== "";
+    return this.waiting.length > 0 || (stopped && (this.held || this.deadman === "held"));
+  }
+
+  /** Return what makes the arm move again. */
+  #resume() {
+    return this.mustRelease ? this.#again() : `Hold ${this.holdName()} to continue.`;
+  }
+
+  #again() {
+    return `Release everything, then hold ${this.holdName()} again.`;
   }
 
   /**
@@ -152,9 +167,10 @@ export class Status {
    * @param {boolean} playing
    */
   advise(present, held, pushed, playing) {
+    this.held = held;
     show(byId("focus"), this.lease.mine && !present);
     setText(byId("waiting"), this.#advice(present, held, pushed, playing));
-    const strong = this.lease.mine && (this.waiting.length > 0 || (pushed && !held && !playing));
+    const strong = this.lease.mine && (this.mustRelease || (pushed && !held && !playing));
     setData(byId("waiting"), "tone", strong ? "strong" : null);
   }
 
@@ -166,14 +182,12 @@ export class Status {
       return free ? 'Press "Take control" to drive.' : `${this.lease.text}.`;
     }
     if (!present) return "Click this page to continue.";
-    if (this.waiting.length) return `Release first: ${this.waiting.join(", ")}`;
-    if (playing) return "The tour is playing.";
     if (this.faulty) return "The arm has a fault.";
-    const again = `Release ${hold}, then hold it again.`;
-    if (this.trip !== "none") return held ? again : `Stopped. Hold ${hold} to continue.`;
+    if (this.mustRelease || this.trip !== "none") return this.#resume();
+    if (playing) return "The tour is playing.";
     if (!held) return pushed ? `Hold ${hold} too: the arm moves only while it is held.` : `Stopped. Hold ${hold} to move.`;
     if (this.deadman !== "held") return "Hold signal not received";
-    if (this.status === "holding") return again; // held since before a session began
+    if (this.status === "holding") return this.#again(); // held since before a session began
     return this.moving ? "Moving" : "Ready";
   }
 
