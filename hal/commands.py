@@ -58,6 +58,8 @@ PATH_KNOTS = 1000
 """Greatest number of knots in a planned path: the servo's process takes some milliseconds to check so many."""
 FIRST_STEP_ANGLE = 0.1
 """Greatest distance of a first joint target from the set-point, rad per joint."""
+PATIENCE = 10.0
+"""A motion that is allowed to move, and makes no progress for so long, is given up, s."""
 FIRST_STEP_DISTANCE = 0.05
 """Greatest distance of a first pose from the set-point, m."""
 FIRST_STEP_TURN = 0.2

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, product
-from math import isfinite, sqrt
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,7 @@ _SAMPLES = 300
 _MOSTLY = 0.25
 """Two links that touch in this share of them are left out: their shapes are too coarse to tell more."""
 _RESERVE = 0.05
-"""After all pairs were looked at, the joints can turn so far before that is done again, rad."""
+"""Pairs that may get too near before each joint has turned so far, rad, are looked at more often than the others."""
 _RING = 16
 """Points on the outline of a circle."""
 _SHARE_AT_HOME = 0.5
@@ -145,20 +145,19 @@ class PairBounds:
         self.distances: Array = np.full(model.count, -np.inf)
         """Distances (pairs,), m, at the positions where each was computed last: of the pairs that :meth:`near` returns,
         those at its ``q``."""
-        self.room = 0.0
-        """No pair can get under the ``least`` of the last call of :meth:`near` as long as the joints are, with the ways
-        that they still go, within this distance (Euclidean, rad) of the positions of that call."""
+        self.weights: Array = np.full(model.n, np.inf)
+        """(n,), 1/rad: no pair gets under the ``least`` of the last call of :meth:`near` as long as the turns of the
+        joints since the positions of that call, times these, make less than 1 together."""
         self._at: Array = np.zeros((model.count, model.n))
-        self._lengths: Array = np.maximum(np.linalg.norm(model.levers, axis=1), 1e-9)
         self._least: Array | None = None
         self._centre: Array = np.zeros(model.n)
-        """Where all pairs were looked at last, rad, and the room of those that are not in the list of near ones."""
-        self._rest = -1.0
+        """Where all pairs were looked at last, rad, and the weights there of those that are not in the list of near
+        ones."""
+        self._rest = self.weights
         self._few: NDArray[np.intp] = np.empty(0, np.intp)
         """The near pairs, and their rows of the arrays above."""
         self._few_levers = model.levers
-        self._few_lengths = self._lengths
-        self._few_least: Array = self._lengths
+        self._few_least: Array = model.margins
 
     def near(self, q: Array, way: Array, least: Array) -> list[int]:
         """Return the pairs that may get under ``least`` (pairs,), m, on a way that begins at ``q`` (n,), rad.
@@ -168,53 +167,48 @@ class PairBounds:
             way: How far each joint may move from there at most (n,), rad.
             least: Distance of each pair, m; not to be changed between calls.
         """
-        moved = q - self._centre
-        left = self._rest - sqrt(moved.dot(moved))
-        if least is not self._least or left < sqrt(way.dot(way)):
+        if least is not self._least:
             return self._look_at_all(q, way, least)
-        few = self._few
-        if not len(few):
-            self.room = left
-            return []
-        bounds = self.distances[few] - (self._few_levers * np.abs(self._at[few] - q)).sum(axis=1)
-        found = self._compute(q, few, bounds, self._few_levers @ way + self._few_least)
-        self.room = max(0.0, min(left, float(((bounds - self._few_least) / self._few_lengths).min())))
-        return found
+        left = 1.0 - float(self._rest.dot(np.abs(q - self._centre)))
+        if not left > 0.5 + float(self._rest.dot(way)):
+            return self._look_at_all(q, way, least)
+        few, levers = self._few, self._few_levers
+        bounds = self.distances[few] - (levers * np.abs(self._at[few] - q)).sum(axis=1)
+        needed = levers @ way + self._few_least
+        self._compute(q, few, bounds, np.maximum(needed, 0.5 * (self.distances[few] + self._few_least)))
+        self.weights = np.maximum(self._rest / left, _weights(levers, bounds - self._few_least))
+        return [int(k) for k in few[bounds < needed]]
 
     def _look_at_all(self, q: Array, way: Array, least: Array) -> list[int]:
         levers = self.model.levers
-        everything = np.arange(self.model.count)
         needed = levers @ way + least
         bounds = self.distances - (levers * np.abs(self._at - q)).sum(axis=1)
-        self._compute(q, everything, bounds, needed + _RESERVE * self._lengths)
-        rooms = (bounds - least) / self._lengths
-        near = rooms < sqrt(way.dot(way)) + _RESERVE
+        listed = needed + _RESERVE * levers.sum(axis=1)
+        self._compute(q, np.arange(self.model.count), bounds, listed)
+        near = bounds < listed
         self._least, self._centre = least, q.copy()
-        self._rest = float(rooms[~near].min(initial=np.inf))
         self._few = np.flatnonzero(near)
-        self._few_levers, self._few_lengths = levers[near], self._lengths[near]
-        self._few_least = least[near]
-        self.room = max(0.0, float(rooms.min(initial=np.inf)))
-        # All that may be under it have just been computed: what is below the greater need includes them.
+        self._few_levers, self._few_least = levers[near], least[near]
+        self._rest = _weights(levers[~near], (bounds - least)[~near])
+        self.weights = np.maximum(self._rest, _weights(self._few_levers, (bounds - least)[near]))
         return [int(k) for k in np.flatnonzero(bounds < needed)]
 
-    def _compute(self, q: Array, pairs: NDArray[np.intp], bounds: Array, needed: Array) -> list[int]:
-        """Compute the pairs whose bounds (m, changed in place) are below what is needed; return those still below."""
+    def _compute(self, q: Array, pairs: NDArray[np.intp], bounds: Array, needed: Array) -> None:
+        """Compute the pairs whose bounds (m, changed in place) are below what is needed."""
         low = np.flatnonzero(bounds < needed)
         if not len(low):
-            return []
+            return
         model = self.model
         model.place(q)
         if 2 * len(low) > model.count:
             self.distances = model.distances()
             self._at[:] = q
             bounds[:] = self.distances[pairs]
-        else:
-            for i in low:
-                k = int(pairs[i])
-                self.distances[k] = bounds[i] = model.distance(k)
-                self._at[k] = q
-        return [int(k) for k in pairs[low[bounds[low] < needed[low]]]]
+            return
+        for i in low:
+            k = int(pairs[i])
+            self.distances[k] = bounds[i] = model.distance(k)
+            self._at[k] = q
 
     def nearest(self, q: Array) -> tuple[int, float]:
         """Return the nearest pair at ``q`` (n,), rad, and its distance, m."""
@@ -225,6 +219,19 @@ class PairBounds:
         self._at[:] = q
         k = int(np.argmin(self.distances))
         return k, float(self.distances[k])
+
+
+def _weights(levers: Array, rooms: Array) -> Array:
+    """Return the share (n,), 1/rad, of the room of any pair that a turn of each joint takes at most.
+
+    Args:
+        levers: (pairs, n), m/rad.
+        rooms: How much nearer the shapes of each pair may come (pairs,), m.
+    """
+    if rooms.min(initial=np.inf) <= 0.0:
+        return np.full(levers.shape[1], np.inf)
+    weights: Array = (levers / rooms[:, np.newaxis]).max(axis=0, initial=0.0)
+    return weights
 
 
 # The scene: built once for each set of arms and boxes.

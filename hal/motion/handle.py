@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..arguments import number
+from ..commands import PATIENCE
 from ..errors import MotionStopped
 from ..types import Limited, MotionOutcome, RobotState, RobotStatus, Trip
 
@@ -179,7 +180,7 @@ class ArmMotion:
                     if servo.off_path:
                         raise MotionStopped(
                             f"{robot.name} cannot continue on its path: it was moved away from it, no plan leads on, "
-                            "or it made no progress for 10 s",
+                            f"or it made no progress for {PATIENCE:g} s",
                             "plan a new motion",
                             code="off_path",
                         )

@@ -8,7 +8,8 @@ another arm has approached) may not come nearer: moving apart is always possible
 An arm that follows torques may be elsewhere than its set-point. It is checked where it is measured
 (:class:`MeasuredGuard`).
 
-Most ticks cost one comparison: no pair can be too near within some distance of where the last one was computed.
+Most ticks cost a few multiplications: from the last distances follows how far the joints can turn, and how far their
+stop can go, before any pair can be too near.
 """
 
 from __future__ import annotations
@@ -69,9 +70,7 @@ class CollisionGuard:
         """Smallest distance allowed for each pair that is inside its margin, m."""
         self._fastest = [0.0] * smoother.n
         self._slowest = 0.0
-        self._per_speed = self._per_acceleration = self._per_goal = 0.0
-        self.slowed = False
-        """Whether the last goal was slowed down."""
+        self._per_speed = self._per_acceleration = 0.0
         self.measured = MeasuredGuard(model, others)
         """Checks the arm itself while it follows torques."""
 
@@ -79,7 +78,6 @@ class CollisionGuard:
         """Open a session whose joints stay below ``velocity`` (n,), rad/s."""
         smoother = self._smoother
         self._floors.clear()
-        self.slowed = False
         # Bounds on the way of a stop, linear in its first speed and acceleration: see TcpReference.open.
         steady, worst, braked = [], [], []
         self._fastest = []
@@ -91,20 +89,20 @@ class CollisionGuard:
             braked.append(self._braking_way(u, A, J) / u)
             self._fastest.append(u)
         self._slowest = min(self._fastest)
-        self._per_speed, self._per_acceleration, self._per_goal = max(steady), max(worst), max(braked)
+        self._per_speed, self._per_acceleration = max(steady), max(worst)
+        self._around.measure_ways(braked, steady, worst)
 
-    def is_far(self, dq: Floats) -> bool:
-        """Return whether the arm can surely follow the goal speeds ``dq`` (n,), rad/s, now, and brake gently later."""
-        return self._around.is_clear(self._smoother.q, self._per_goal * hypot(*dq))
+    def is_far(self, speed: float) -> bool:
+        """Return whether the arm can surely follow goal speeds of this length, rad/s, now, and brake gently later."""
+        q, around = self._smoother.q, self._around
+        taken = around.shares[0] * speed
+        return taken <= around.left if q is around.last else around.is_clear(q, taken)
 
     def slow(self, dq: list[float]) -> list[float]:
         """Return the goal speeds ``dq`` (n,), rad/s, slowed down so far that the arm can brake before a margin.
 
         All joints keep their proportions, so that the arm keeps its direction.
         """
-        self.slowed = False
-        if self.is_far(dq):
-            return dq
         smoother, around = self._smoother, self._around
         limits = zip(dq, smoother.acceleration, smoother.jerk, strict=True)
         near = around.near(smoother.q, [self._braking_way(abs(v), A, J) for v, A, J in limits])
@@ -136,7 +134,6 @@ class CollisionGuard:
             share = min(share, cap / speed)
         if share >= 1.0:
             return dq
-        self.slowed = True
         return [share * v for v in dq]
 
     def allows(self) -> bool:
@@ -144,10 +141,11 @@ class CollisionGuard:
         smoother, around = self._smoother, self._around
         q, dq, ddq = smoother.q_next, smoother.dq_next, smoother.ddq_next
         speed, acceleration = hypot(*dq), hypot(*ddq)
+        if speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True)):
+            _, per_speed, per_acceleration = around.shares
+            if around.is_clear(q, per_speed * speed + per_acceleration * acceleration):
+                return True
         if speed == acceleration == 0.0 and dist(q, smoother.q) < _NOWHERE:
-            return True
-        known = speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True))
-        if known and around.is_clear(q, self._per_speed * speed + self._per_acceleration * acceleration):
             return True
         limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
         ways = [
@@ -283,31 +281,64 @@ class _Surroundings:
         self._others = list(zip(rest, others, strict=True))
         self._q: Array = np.zeros(model.n)
         self._ways: Array = np.zeros(model.n)
-        self._at: list[Floats] = [[inf] * (part.stop - part.start) for part in model.slices]
-        """Joint positions of this arm and of the others at which the room was computed, rad."""
-        self._room = 0.0
-        """Distance of the joints from there, all arms together, within which no pair gets near, rad."""
+        n = self.own.stop - self.own.start
+        self._scales: Array = np.ones((1, n))
+        self.last: Floats = ()
+        """Joint positions (n,), rad, of the newest call of :meth:`is_clear` that returned true, and the share of the
+        room that was left there."""
+        self.left = 0.0
+        self.shares: list[float] = []
+        """The share of all room that the length of each vector of :meth:`measure_ways` takes at most."""
+        self._weights, self._turned, self._per_turn = [inf] * n, inf, inf
+        """The share of the room that each rad of each joint takes (n,); that the turns from the computed positions to
+        some later ones have taken; and that each rad of the joints together takes."""
+        self._at: Floats = (0.0,) * n
+        self._later: Floats = self._at
+        self._others_at: list[tuple[Neighbour, Floats, float]] = []
+        """The other arms, where they were, and the share of the room that each rad of their joints takes."""
+        self.measure_ways([1.0] * n)
 
-    def is_clear(self, q: Floats, way: float) -> bool:
-        """Return whether no pair can get near within ``way`` (rad, all joints together) of ``q`` (n,)."""
-        moved = dist(q, self._at[0]) + way
-        if moved > self._room:
-            return False
-        for at, (_, neighbour) in zip(self._at[1:], self._others, strict=True):
+    def measure_ways(self, *scales: Floats) -> None:
+        """Measure the joints' ways by vectors: joint j goes at most ``scale[j] * vector[j]``, in rad, for each."""
+        self._scales = np.array(scales)
+        self.shares = [inf] * len(scales)
+        self._weights, self._turned, self.left = [inf] * len(self._at), inf, -inf
+
+    def is_clear(self, q: Floats, taken: float) -> bool:
+        """Return whether no pair can get near from ``q`` (n,) on ways that take this share of the room."""
+        room = 1.0
+        for neighbour, at, per_turn in self._others_at:
             there, end = neighbour()
-            moved = hypot(moved, max(dist(there, at), dist(end, at)))
-        return moved <= self._room
+            room -= per_turn * (dist(at, there) + dist(there, end))
+        left = room - self._turned - self._per_turn * dist(q, self._later)
+        if not taken <= left:
+            if self._per_turn == inf:
+                return False
+            turned = sum([w * abs(x - x0) for w, x, x0 in zip(self._weights, q, self._at, strict=True)])
+            left = room - turned
+            if taken > left:
+                return False
+            self._later, self._turned = tuple(q), turned
+        self.last, self.left = q, left
+        return True
 
     def near(self, q: Floats, ways: Floats) -> list[int]:
         """Return the pairs that may get near while the joints move this far (n,), rad, from ``q``."""
         self._q[self.own], self._ways[self.own] = q, ways
-        self._at = [q]
         for part, neighbour in self._others:
             there, end = neighbour()
             self._q[part], self._ways[part] = there, np.abs(np.subtract(end, there))
-            self._at.append(there)
         near = self.bounds.near(self._q, self._ways, self.least)
-        self._room = self.bounds.room
+        weights = self.bounds.weights
+        own = weights[self.own]
+        self._weights, self._turned, self._per_turn = own.tolist(), 0.0, sqrt(own.dot(own))
+        self.shares = np.sqrt(np.square(self._scales * own).sum(axis=1)).tolist()
+        self._at = self._later = tuple(q)
+        self.last = ()
+        self._others_at = [
+            (neighbour, self._q[part].tolist(), sqrt(weights[part].dot(weights[part])))
+            for part, neighbour in self._others
+        ]
         return near
 
     def approach_of_others(self, pairs: Sequence[int]) -> Array:
@@ -377,12 +408,12 @@ class MeasuredGuard:
 
     def is_clear(self, q: Floats, way: float) -> bool:
         """Return whether no pair can get near within ``way`` (rad, all joints together) of ``q`` (n,)."""
-        return self._around.is_clear(q, way)
+        return self._around.is_clear(q, self._around.shares[0] * way)
 
     def allows(self, q: Floats, ends: Sequence[Floats]) -> bool:
         """Return whether no shapes get too near on straight ways from ``q`` (n,) to ``ends``, each (n,), rad."""
         around = self._around
-        if around.is_clear(q, max([dist(q, end) for end in ends])):
+        if self.is_clear(q, max([dist(q, end) for end in ends])):
             return True
         ways = [max(map(abs, turns)) for turns in zip(*[map(sub, end, q) for end in ends], strict=True)]
         near = around.near(q, ways)

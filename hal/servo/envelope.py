@@ -383,7 +383,7 @@ class Envelope:
             return False
         if self.tcp_speed < UNLIMITED and not self._tcp.surely_slower(dq, self.goal_tcp_speed):
             return False
-        return self.far_from_faces() and (self.collisions is None or self.collisions.is_far(dq))
+        return self.far_from_faces() and (self.collisions is None or self.collisions.is_far(speed))
 
     def cap_joints(self, dq: list[float]) -> list[float]:
         """Return goal velocities (n,), rad/s, cut to the session's speed and to braking before a limit."""
@@ -415,10 +415,11 @@ class Envelope:
             The goal, and whether the joints must change their speeds in proportion on the way there: each by itself,
             they might move the tcp too fast in between.
         """
-        if self.collisions is not None:
-            dq = self.collisions.slow(dq)
-            if self.collisions.slowed:
+        if self.collisions is not None and not self.collisions.is_far(hypot(*dq)):
+            slower = self.collisions.slow(dq)
+            if slower is not dq:
                 self.limited |= Limited.COLLISION
+                dq = slower
         if self.tcp_speed >= UNLIMITED and self.workspace is None:
             return dq, False
         fast = not self._tcp.surely_slower(dq, self.goal_tcp_speed)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from math import dist, hypot, isfinite
 from typing import Any
 
-from ..commands import CommandRecord, Inbox, Kind, Session
+from ..commands import PATIENCE, CommandRecord, Inbox, Kind, Session
 from ..driver import Reading, Setpoint
 from ..errors import CommandError, ControlTaken, Fault
 from ..kinematics.arm import Kinematics
@@ -43,9 +43,6 @@ _POSITION = ControlMode.POSITION
 
 _ABSURD = 1e3
 """Joint speeds beyond this are an invalid reading, rad/s."""
-
-PATIENCE = 10.0
-"""A motion that is allowed to move, and makes no progress for so long, is given up, s."""
 
 _BEYOND = 1.0
 """Joint positions this far beyond the joint's range are an invalid reading, rad."""

@@ -28,16 +28,19 @@ def test_torques_towards_the_table_are_stopped_before_its_margin() -> None:
 
 def test_a_compliant_arm_that_is_pushed_beyond_the_margin_is_held() -> None:
     free, pushed = BENCHMARK["pushes"](forces=(0.0, 20.0), names=("tcp 1000 N/m",)).values()
-    assert free in ("10.0 mm, no trip", "10.3 mm, no trip")
+    distance, end = free.split(" mm, ")
+    assert 9.95 <= float(distance) <= 11.0
+    assert end == "no trip"
     distance, end = pushed.split(" mm, ")
     assert float(distance) >= 5.0
     assert end == "torque_limit"
 
 
-def test_an_arm_inside_a_margin_comes_home_or_is_refused_at_once() -> None:
-    found = BENCHMARK["starts"]("so101", 12)
-    assert found["came home"] + found["refused at once"] == 12
-    assert found["came home"] >= 6
+@pytest.mark.parametrize(("model", "count"), [("so101", 4), ("piper", 2)])
+def test_an_arm_inside_a_margin_comes_home_or_is_refused_at_once(model: str, count: int) -> None:
+    found = BENCHMARK["starts"](model, count)
+    assert found["came home"] + found["refused at once"] == count
+    assert found["came home"] >= count // 2
 
 
 def test_a_motion_into_another_arm_is_refused_before_anything_moves() -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
+from hal.commands import NO_INBOX, PATIENCE, CommandRecord, Inbox, Kind, Session
 from hal.config import load
 from hal.driver import Reading
 from hal.geometry import Pose
@@ -17,7 +17,7 @@ from hal.kinematics.arm import Kinematics
 from hal.kinematics.collision_model import CollisionModel
 from hal.servo.audit import SetpointAudit
 from hal.servo.collisions import CollisionGuard, Neighbour
-from hal.servo.servo import PATIENCE, Servo
+from hal.servo.servo import Servo
 from hal.servo.smoothing import stop_phases, stop_step
 from hal.specs import BoxSpec, CollisionSpec, RobotSpec
 from hal.types import Limited
@@ -242,28 +242,129 @@ def test_a_compliant_arm_is_checked_off_its_set_point(panda: RobotSpec) -> None:
     assert arm.guard.allows_arm(arm.q, [-v for v in speed], 0.06)
 
 
-def test_no_stop_of_an_accepted_state_enters_a_margin(panda: RobotSpec) -> None:
-    model = CollisionModel([panda], CollisionSpec(boxes=(TABLE,)))
-    smoother = Servo(panda, 1.0 / RATE_HZ).smoother
-    guard = CollisionGuard(model, smoother)
-    guard.open(panda.limits.velocity)
-    velocity = np.array(panda.limits.velocity)
+POLES = tuple(
+    BoxSpec(f"pole{k}", (0.5, y, 0.5), (0.0, 0.0, 0.0, 1.0), (0.01, 0.01, 1.0)) for k, y in enumerate((-0.4, 0.3))
+)
+
+
+_FAST = 8.0
+"""No part of an arm is faster, m/s."""
+
+
+class Stops:
+    """Steps that a guard is asked for, and the distances in the stops after them."""
+
+    def __init__(self, spec: RobotSpec, boxes: tuple[BoxSpec, ...], other: RobotSpec | None = None) -> None:
+        limits = replace(spec.limits, jerk=(150.0,) * 7)  # so small that joints go on, and turn back
+        self.spec = replace(spec, limits=limits)
+        self.model = CollisionModel([spec, other] if other else [spec], CollisionSpec(own=False, boxes=boxes))
+        self.smoother = Servo(self.spec, 1.0 / RATE_HZ).smoother
+        self.elsewhere: list[Sequence[float]] = [other.home, other.home] if other else []
+        others: list[Neighbour] = [lambda: (self.elsewhere[0], self.elsewhere[1])] if other else []
+        self.guard = CollisionGuard(self.model, self.smoother, others)
+        self.guard.open(limits.velocity)
+
+    def room(self, q: Sequence[float], share: float = 0.0) -> float:
+        """Return the smallest distance less margin, m, with the other arm at this share of its stop."""
+        there = np.array(self.elsewhere)
+        between = (1.0 - share) * there[0] + share * there[1] if len(there) else []
+        self.model.place([*q, *between])
+        return float((self.model.distances() - self.model.margins).min())
+
+    def propose(self, q: Sequence[float], dq: Sequence[float], ddq: Sequence[float]) -> bool:
+        """Return whether the guard allows a step that ends so."""
+        self.smoother.q_next, self.smoother.dq_next, self.smoother.ddq_next = list(q), list(dq), list(ddq)
+        return self.guard.allows()
+
+    def least_room(self) -> float:
+        """Return the smallest room in the stop after the proposed step, m."""
+        smoother = self.smoother
+        step = zip(
+            smoother.q_next, smoother.dq_next, smoother.ddq_next, smoother.acceleration, smoother.jerk, strict=True
+        )
+        joints = list(step)
+        duration = max(stop_phases(v, a, A, J)[3] for _, v, a, A, J in joints)
+        least, t = math.inf, 0.0
+        while t < 1.02 * duration:
+            place = [stop_step(x, v, a, A, J, t)[0] for x, v, a, A, J in joints]
+            room = min(self.room(place, share) for share in ((0.0, 0.5, 1.0) if self.elsewhere else (0.0,)))
+            least = min(least, room)
+            t += max(0.02 * duration, room / _FAST)
+        return least
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_no_stop_of_an_accepted_step_enters_a_margin(panda: RobotSpec, moving: bool) -> None:
+    other = replace(panda, name="other", base_position=(1.0, 0.0, 0.0), base_orientation=(0.0, 0.0, 1.0, 0.0))
+    stops = Stops(panda, () if moving else (TABLE, *POLES), other if moving else None)
+    low, high = np.array(panda.limits.lower), np.array(panda.limits.upper)
+    fastest, hardest = np.array(panda.limits.velocity), 0.999 * np.array(panda.limits.acceleration)
     rng = np.random.default_rng(2)
     accepted = refused = 0
-    for q in np.clip(OVER_THE_TABLE + rng.normal(0.0, 0.4, (300, 7)), panda.limits.lower, panda.limits.upper):
-        dq = rng.uniform(-velocity, velocity)
-        model.place(q)
-        if (model.distances() < model.margins).any():
+    for _ in range(10 if moving else 40):
+        middle = np.clip(OVER_THE_TABLE + rng.normal(0.0, 0.4, 7), low, high)
+        stops.elsewhere[:] = [panda.home, panda.home] if moving else []
+        if stops.room(middle) < 0.0:
             continue
-        smoother.anchor(q.tolist())
-        smoother.q_next, smoother.dq_next, smoother.ddq_next = q.tolist(), dq.tolist(), [0.0] * 7
-        if not guard.allows():
-            refused += 1
-            continue
-        accepted += 1
-        joints = list(zip(q, dq, smoother.acceleration, smoother.jerk, strict=True))
-        for t in np.linspace(0.0, max(stop_phases(v, 0.0, A, J)[3] for _, v, A, J in joints), 30):
-            model.place([stop_step(x, v, 0.0, A, J, t)[0] for x, v, A, J in joints])
-            assert (model.distances() - model.margins).min() > -2e-5
+        stops.smoother.anchor(middle.tolist())
+        stops.propose(middle, 1e-3 * fastest, np.zeros(7))  # from what is known here follows what is near it
+        for _ in range(12):
+            if moving:
+                there = np.array(panda.home) + rng.choice([0.0, 0.05, 0.3]) * rng.normal(size=7)
+                stops.elsewhere[:] = [there, there + rng.choice([0.0, 0.3]) * rng.normal(size=7)]
+            q = np.clip(middle + rng.choice([0.0, 0.02, 0.2]) * rng.normal(size=7), low, high)
+            dq = rng.choice([0.05, 0.3, 1.0]) * rng.uniform(-fastest, fastest)
+            if not stops.propose(q, dq, rng.uniform(-hardest, hardest)):
+                refused += 1
+                continue
+            accepted += 1
+            assert stops.least_room() > -2e-5
     assert accepted > 50
-    assert refused > 3
+    assert refused > 20
+
+
+@pytest.mark.parametrize("what", ["moved", "fast", "accelerates"])
+def test_nothing_is_taken_for_far_after_a_change(panda: RobotSpec, what: str) -> None:
+    stops = Stops(panda, POLES[1:])
+    q, slowly, still = list(OVER_THE_TABLE), [0.05, *[0.0] * 6], [0.0] * 7
+    while stops.room(q) > 0.02:
+        q[0] += 1e-3
+    stops.smoother.anchor(q)
+    assert stops.propose(q, slowly, still)
+    assert not stops.propose(q, [2.0, *[0.0] * 6], still)
+    assert stops.propose(q, slowly, still)
+    if what == "moved":
+        while stops.room(q) > 1e-5:
+            q[0] += 1e-3
+    changed = {
+        "moved": (q, slowly, still),
+        "fast": (q, [1.0, *[0.0] * 6], still),
+        "accelerates": (q, slowly, [14.0, *[0.0] * 6]),
+    }
+    assert not stops.propose(*changed[what])
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_another_arm_is_not_taken_for_far_after_it_moved_or_set_off(panda: RobotSpec, moved: bool) -> None:
+    other = replace(panda, name="other", base_position=(1.2, 0.0, 0.0), base_orientation=(0.0, 0.0, 1.0, 0.0))
+    stops = Stops(panda, (), other)
+    q, slowly = list(OVER_THE_TABLE), [0.0, 0.05, *[0.0] * 5]
+    stops.smoother.anchor(q)
+    assert stops.propose(q, slowly, [0.0] * 7)
+    near = (0.0, 0.7, 0.0, -1.6, 0.0, 2.3, 0.8)
+    stops.elsewhere[:] = [near, near] if moved else [stops.elsewhere[0], near]
+    assert stops.room(q, 1.0) < 0.0
+    assert not stops.propose(q, slowly, [0.0] * 7)
+
+
+def test_an_arm_inside_a_margin_does_not_pass_through_what_is_near(panda: RobotSpec) -> None:
+    q, x, y, _ = list(OVER_THE_TABLE), *Kinematics(panda.kinematics).fk(OVER_THE_TABLE)[:3]
+    stops = Stops(panda, (replace(POLES[0], position=(x + 0.118, y, 0.3), size=(0.01, 0.01, 0.6)),))
+    q[6] = min(np.linspace(q[6] - 1.5, q[6] + 1.5, 301), key=lambda turn: stops.room([*q[:6], turn])) - 0.1
+    stops.smoother.anchor(q)
+    still = [0.0] * 7
+    assert stops.room(q) < 0.0
+    assert not stops.propose(q, [*still[:6], 1.8], still)
+    assert stops.room(stops.smoother.stop_end_next()) > stops.room(q)
+    assert not stops.propose(q, [*still[:6], 0.1], still)
+    assert stops.propose(q, [*still[:6], -0.1], still)
