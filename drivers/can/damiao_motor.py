@@ -86,6 +86,8 @@ class ChainMotor:
         """Whether this program switched the motor on, and it still is on as far as its replies tell."""
         self.switched_at = 0.0
         """Time of that, s on the host's clock."""
+        self.acknowledged = 0
+        """The error that :meth:`.DamiaoArm.recover` acknowledged: it no longer is a fault."""
         self.status = 0
         self.q = self.dq = self.tau = 0.0
         """Position, velocity and torque of the joint, rad, rad/s and Nm."""
@@ -158,7 +160,7 @@ def motor_fault(motor: ChainMotor, mosfet_limit: float, *, engaged: bool) -> Fau
         engaged: Whether the motor is in use. One that is not may have lost communication: that is its rest.
     """
     status = motor.status
-    if status > 1 and (engaged or status != MotorStatus.LOST_COMMUNICATION):
+    if status > 1 and status != motor.acknowledged and (engaged or status != MotorStatus.LOST_COMMUNICATION):
         if status in _STATUS_FAULTS:
             cause, remedy = _STATUS_FAULTS[MotorStatus(status)]
             return Fault(MotorStatus(status).name.lower(), f"{motor.label}: {cause}", f"{_SUPPORT}; {remedy}")
