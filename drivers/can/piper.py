@@ -245,7 +245,7 @@ class PiperArm(RobotDriver):
         return self._fault or fault
 
     def _hold_measured(self) -> None:
-        """Tell an arm that a fault or a loss stopped before its target to stay: it neither pushes on nor leaps later."""
+        """Tell an arm that stopped before its target to stay: it neither pushes on nor leaps once it is free."""
         status, q, target = self._status, self._q, self._commanded
         assert status is not None
         if self.engaged or q is None or target is None:
