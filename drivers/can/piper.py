@@ -333,8 +333,7 @@ class PiperArm(RobotDriver):
             RobotFault: An error stays; the remedy says how to end it.
             ConnectionLost: The arm does not answer.
         """
-        hold = encode_joint_targets(self._commanded) if self._holding and self._commanded is not None else ()
-        self._link.send([JointRequest().frame(), *hold])  # an arm with an error may have taken no target
+        self._link.send([JointRequest().frame()])
 
         def present() -> Fault | None:
             return None if self._status is None else arm_fault(self._status, self._flags)

@@ -527,22 +527,26 @@ def fastest(arm: SteppedArm, seconds: float, joints: Sequence[int] = range(6)) -
     return max(arm.far.arm.peak[k] for k in joints)
 
 
-def test_an_arm_that_is_pushed_away_gives_way_slowly_and_does_not_snap_back() -> None:
+@pytest.mark.parametrize(("joint", "below", "beyond", "stiffness"), [(0, 12.0, 16.0, 80.0), (5, 3.0, 4.2, 10.0)])
+def test_an_arm_that_is_pushed_away_gives_way_slowly_and_does_not_snap_back(
+    joint: int, below: float, beyond: float, stiffness: float
+) -> None:
+    """Beyond half of what its joint may apply, Nm."""
     with driven() as arm:
-        arm.far.execute("push 1 -12")
-        assert arm.run(0.5, TURN) is None, "12 Nm move a joint of 80 Nm/rad by 0.15 rad"
-        arm.far.execute("push 1 -16")
+        arm.far.execute(f"push {joint + 1} {-below}")
+        assert arm.run(0.5, TURN) is None
+        arm.far.execute(f"push {joint + 1} {-beyond}")
         fault = arm.run(0.5, TURN)
         assert isinstance(fault, RobotFault)
         assert arm.robot.state().fault.code == "not_following"
         assert arm.driver.engaged, "it holds"
-        at = arm.q[0]
+        at = arm.q[joint]
         assert fastest(arm, 2.0) <= 0.5
-        assert arm.q[0] < at - 0.4, "it gives way for as long as it is pushed"
-        at = arm.q[0]
-        arm.far.execute("push 1 0")
+        assert arm.q[joint] < at - 0.4, "it gives way for as long as it is pushed"
+        at = arm.q[joint]
+        arm.far.execute(f"push {joint + 1} 0")
         arm.run(1.0)
-        assert abs(arm.q[0] - at) < 16.0 / 80.0, "the way of its spring, not back to where it was sent"
+        assert abs(arm.q[joint] - at) < beyond / stiffness, "the way of its spring, not back to where it was sent"
 
 
 @pytest.mark.parametrize("line", ["status 6 a", "silent 6 on"])

@@ -123,10 +123,13 @@ def test_an_arm_that_is_pushed_off_its_set_point_is_a_fault_holds_where_it_is_an
         push(100.0)
         with pytest.raises(hal.RobotFault):
             hold(0.3)
-        rig.clock.sleep(0.5)
+        rig.clock.sleep(0.4)
+        at = arm.state().q
+        rig.clock.sleep(0.2)
         state = arm.state()
         assert state.fault is not None
         assert state.fault.code == "not_following"
+        assert state.q == pytest.approx(at, abs=1e-3)
         assert np.abs(state.q - arm.home).max() > 0.1
         arm.recover()
         rig.clock.sleep(0.02)

@@ -331,6 +331,14 @@ def test_a_piper_that_gets_no_targets_does_not_race_to_a_far_one_later(piper: Be
     assert not driver.engaged
     piper.arm.take = take
     assert piper.fastest(0.5) < 0.01
+    before = piper.arm.commands
+    piper.cycle(5)
+    assert piper.arm.commands > before, "it is told to stay where it is"
+    piper.arm.control = 2  # a hand takes it over
+    piper.cycle(3)
+    before = piper.arm.commands
+    piper.cycle(5)
+    assert piper.arm.commands == before
 
 
 def test_a_piper_is_not_taken_over_while_a_hand_or_another_program_moves_it(piper: Bench) -> None:
