@@ -88,6 +88,8 @@ class DamiaoArm(RobotDriver):
         self._switching: ChainMotor | None = None
         """The motor that is being switched on."""
         self._attempts = 0
+        self._limp: list[ChainMotor] = []
+        """Motors that did not switch on."""
         self._t_switched = 0.0
         self._now = 0.0
         self._seq = 0
@@ -104,6 +106,7 @@ class DamiaoArm(RobotDriver):
         self._fault = None
         self._reading = None
         self._written = False
+        self._limp.clear()
         self.chain.open()
 
     def close(self) -> None:
@@ -311,15 +314,19 @@ class DamiaoArm(RobotDriver):
             elif self._now - self._t_switched < SWITCHING:
                 return
         if motor is None:
-            motor = next((one for one in self._motors if not one.on), None)
+            motor = next((one for one in self._motors if not one.on and one not in self._limp), None)
             self._attempts = 0
         if motor is None:
+            if self._limp:
+                self._give_up()
             self.engaged = True
             self._dq_sent, self._tau_sent = self._zeros, None
             return
         self._attempts += 1
-        if self._attempts > _ATTEMPTS:
-            self._give_up(motor)
+        if self._attempts > _ATTEMPTS:  # the others come first: they hold what can be held
+            motor.on, self._switching = False, None
+            self._limp.append(motor)
+            return
         self._switch_on(motor)
 
     def _switch_on(self, motor: ChainMotor) -> None:
@@ -329,10 +336,10 @@ class DamiaoArm(RobotDriver):
         self._switching, self._t_switched = motor, self._now
         self.chain.switch_on(motor, hold, self._attempts == 1)
 
-    def _give_up(self, motor: ChainMotor) -> None:
+    def _give_up(self) -> None:
         """Raise RobotFault for a motor that does not switch on; those that are on continue to hold."""
-        self._switching = None
-        motor.on = False
+        motor = self._limp[0]
+        self._limp.clear()
         fault = motor_fault(motor, self.settings.mosfet_limit, engaged=True)
         why = "" if fault is None else f" ({fault.cause.removeprefix(f'{motor.label}: ')})"
         raise RobotFault(
@@ -354,6 +361,7 @@ class DamiaoArm(RobotDriver):
         if fault is not None:
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
         self._fault = None
+        self._limp.clear()
 
     # Model and statistics.
 
