@@ -25,7 +25,7 @@ from hal.histogram import Histogram
 from hal.specs import RobotSpec
 
 from .damiao_chain import SWITCHING, DamiaoChain
-from .damiao_motor import MILD_FAULTS, ChainMotor, motor_fault
+from .damiao_motor import MILD_FAULTS, ChainMotor, find_turned, motor_fault
 from .settings import DamiaoArmSettings
 
 __all__ = ["DamiaoArm"]
@@ -101,13 +101,21 @@ class DamiaoArm(RobotDriver):
     # Connection.
 
     def open(self) -> None:
-        """Connect, and compare the registers of every motor with the rig. Nothing moves or is switched on."""
+        """Connect, and compare the motors' registers and positions with the rig. Nothing moves or is switched on.
+
+        Raises:
+            RobotFault: A motor is full turns away from its joint's range; names it.
+        """
         self.close()
         self._fault = None
         self._reading = None
         self._written = False
         self._limp.clear()
         self.chain.open()
+        turned = find_turned(self._motors, self.spec.limits)
+        if turned is not None:
+            self.chain.close()
+            raise RobotFault(turned.cause, turned.remedy, code=turned.code)
 
     def close(self) -> None:
         """Let an arm that is engaged sink slowly until it rests; switch it off and disconnect.
@@ -198,7 +206,7 @@ class DamiaoArm(RobotDriver):
         fault = self.chain.fault(engaged=self.engaged)
         if fault is not None and fault.code not in MILD_FAULTS:
             return fault
-        grave = self._check_following()
+        grave = self._check_following() if self.engaged else find_turned(self._motors, self.spec.limits)
         if grave is None and self.engaged and not on:
             off = next(motor for motor in self._motors if not motor.on)
             grave = Fault(
@@ -211,7 +219,7 @@ class DamiaoArm(RobotDriver):
 
     def _check_following(self) -> Fault | None:
         """Return a fault if a joint is too far from its set-point."""
-        if not self.engaged or self._tau_sent is not None:
+        if self._tau_sent is not None:
             return None
         return self._following.check(self._now, [motor.q for motor in self._motors], self._target, self._dq_sent)
 

@@ -293,6 +293,7 @@ def test_an_arm_with_a_motor_that_gets_hot_is_braked_within_its_limits() -> None
         ("register 6 TMAX 7", ConfigError, "wrong_range"),
         ("register 3 TIMEOUT 0", ConfigError, "no_timeout"),
         ("register 5 CTRL_MODE 2", ConfigError, "wrong_mode"),
+        ("place 0 1.5 1.35 -1.42 0 6.4", RobotFault, "full_turn"),
         ("silent 3 on", DeviceNotFound, "motor_missing"),
         ("silent all on", DeviceNotFound, "motor_missing"),
     ],
@@ -305,7 +306,7 @@ def test_a_fault_before_the_start_is_refused_by_motor(command: str, error: type[
             driver.open()
         found = raised.value.problems[0].code if isinstance(raised.value, ConfigError) else raised.value.code
         assert found == code
-        number = "motor 1" if "all" in command else f"motor {command.split()[1]}"
+        number = {"all": "motor 1", "0": "motor 6"}.get(command.split()[1], f"motor {command.split()[1]}")
         assert number in str(raised.value), "the message names the motor"
         assert all(state["status"] == "0" for state in far.execute("state")["motors"].values()), "nothing is energised"
         TABLE.append(f"| {command}, before the start | {error.__name__}: {code}, names {number} | at once | off | |")
