@@ -17,7 +17,7 @@ from typing import Any
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalError, Problem
 from hal.lock import DeviceLock
 
-from .bus import CanBus
+from .bus import CanBus, describe_losses
 from .damiao_motor import CHECKED_REGISTERS, HEAT_MARGIN, MILD_FAULTS, ChainMotor, motor_fault, register_problems
 from .damiao_protocol import (
     CLEAR_ERROR,
@@ -499,7 +499,9 @@ class DamiaoChain:
         afterwards; ``doubled`` replies came twice; ``unexpected`` frames have an id that no device on the bus has.
         """
         motors = self.motors
+        lost = sum(motor.missing - motor.late for motor in motors)
         return {
+            "warnings": describe_losses(self.name, self.settings.channel, lost, self.cycles * len(motors)),
             "cycles": self.cycles,
             "incomplete": self.incomplete,
             "missing": sum(motor.missing for motor in motors),

@@ -19,6 +19,7 @@ from hal.following import Following
 from hal.lock import DeviceLock
 from hal.specs import RobotSpec
 
+from .bus import describe_losses
 from .piper_link import FRESH_READS, SILENCE, PiperLink, arm_fault, control_fault, join_joints, refusal
 from .piper_protocol import (
     ACKNOWLEDGEMENT,
@@ -105,7 +106,8 @@ class PiperArm(RobotDriver):
         self._moving: set[int] = set()
         """Joints whose speed has been reported."""
         self._pairs: list[tuple[float, float]] = [(0.0, 0.0)] * 3
-        self._pairs_come = 0
+        self._pairs_come = self._incomplete = 0
+        """Which of the three frames of a sample have come, and samples that lacked one."""
         self._t_pairs = -inf
         self._commanded: tuple[float, ...] | None = None
         """The last target that it got, rad; also after a fault or a loss, since the arm still goes there."""
@@ -213,6 +215,7 @@ class PiperArm(RobotDriver):
         elif type(record) is JointAngles:
             k = record.first // 2
             if k == 0:  # the arm sends them in order: a set that lacks one is dropped
+                self._incomplete += self._pairs_come > 0
                 self._t_pairs, self._pairs_come = self._now, 0
             self._pairs[k] = record.q
             self._pairs_come |= 1 << k
@@ -354,9 +357,12 @@ class PiperArm(RobotDriver):
 
     def statistics(self) -> dict[str, Any]:
         joints = [joint for joint in self._joints if joint is not None]
+        lost, channel = self._incomplete, self.settings.channel
         return {
+            "warnings": describe_losses(self.spec.name, channel, lost, 3 * (self._seq + lost)),
             "bus": self._link.statistics(),
             "samples": self._seq,
+            "incomplete": lost,
             "longest_gap_s": self.longest_gap,
             "faults": self.faults,
             "motor_temperatures": [joint.motor_temperature for joint in joints],
