@@ -264,7 +264,9 @@ class PiperArm(RobotDriver):
         """Return a fault if a joint is too far from its target: the arm would race there as soon as it can."""
         if self._commanded is None or self._q is None:
             return None
-        return self._following.check(self._now, self._q, self._commanded, self._commanded_dq)
+        fault = self._following.check(self._now, self._q, self._commanded, self._commanded_dq)
+        remedy = "check what the arm touches, and `speed_percent` in the rig"
+        return None if fault is None else Fault(fault.code, fault.cause, remedy)
 
     def write(self, setpoint: Setpoint) -> bool:
         if not self.engaged:
