@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import logging
 import os
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
@@ -436,6 +437,7 @@ class Rig:
         sessions = [robot._open for robot in self.robots.values() if robot._open is not None]
         shown = [item for item in (self.viewer3d, self.console, self._viewer, self._pictures) if item is not None]
         ends = [device.close for device in (*sessions, *self.gamepads.values(), *self.cameras.values(), *shown)]
+        ends.insert(len(ends) - len(shown), self._warn_of_devices)
         ends += [host.request_close for host in self._hosts]  # all at the same time: lowering an arm takes seconds
         ends += [host.close for host in self._hosts]
         for end in ends:
@@ -447,6 +449,16 @@ class Rig:
         atexit.unregister(self._close_at_exit)
         if errors:
             raise errors[0]
+
+    def _warn_of_devices(self) -> None:
+        """Display the ``warnings`` in the statistics of real arms' drivers, for example of lost frames."""
+        for host in self._hosts if self.attended else ():
+            with contextlib.suppress(HalError):  # a lost process has nothing to say
+                host.check()
+                for arm in host.request("statistics")["robots"].values():
+                    for text in arm["driver"].get("warnings", ()):
+                        self.say(text)
+                        warnings.warn(text, RuntimeWarning, stacklevel=3)
 
     def _close_at_exit(self) -> None:
         with contextlib.suppress(Exception):

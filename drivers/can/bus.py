@@ -49,6 +49,10 @@ _NO_QUEUE = frozenset({errno.ENOBUFS, errno.EAGAIN})
 """Errors of a full transmit queue: nothing on the bus acknowledges frames, or there are too many."""
 
 
+_FEWEST, _MANY_LOST = 200, 0.01
+"""Frames from which on a share of lost ones is known, and the share from which it is a warning."""
+
+
 class CanBus:
     """A python-can bus that the devices of one process share.
 
@@ -338,6 +342,14 @@ class CanBus:
             "error_frames": self.error_frames,
             "reopened": self.reopened,
         }
+
+
+def describe_losses(name: str, channel: str, lost: int, expected: int) -> list[str]:
+    """Return a warning if more than 1 % of the frames that were expected from a device did not come; else nothing."""
+    if expected < _FEWEST or lost <= _MANY_LOST * expected:
+        return []
+    remedy = "check wiring, termination (120 ohm at both ends), bit rate and bus load: hal-check --real"
+    return [f"{name}: {100.0 * lost / expected:.1f} % of the frames on {channel} were lost; {remedy}"]
 
 
 def can_interfaces() -> tuple[str, ...]:

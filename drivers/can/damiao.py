@@ -20,11 +20,12 @@ from typing import Any, ClassVar
 from hal.driver import Reading, RobotDriver, Setpoint
 from hal.dynamics import Dynamics
 from hal.errors import ConnectionLost, Fault, RobotFault
+from hal.following import Following
 from hal.histogram import Histogram
 from hal.specs import RobotSpec
 
 from .damiao_chain import SWITCHING, DamiaoChain
-from .damiao_motor import MILD_FAULTS, ChainMotor
+from .damiao_motor import MILD_FAULTS, ChainMotor, find_turned, motor_fault
 from .settings import DamiaoArmSettings
 
 __all__ = ["DamiaoArm"]
@@ -33,6 +34,8 @@ _STICKING = 0.02
 """Speed below which the friction that a command adds falls to zero, rad/s: it would make a joint at rest tremble."""
 _PUSHING = 0.5
 """An arm is blocked if a joint's distance from its set-point lets the motor push with this share of its torque."""
+_YIELDING = 0.4
+"""Speed at which a joint that a fault stopped gives way to where it is, rad/s."""
 _BRAKE = 0.3
 """Share of a motor's damping in torque mode: it bounds the speed where the torques are no longer renewed."""
 _ATTEMPTS = 3
@@ -61,11 +64,12 @@ class DamiaoArm(RobotDriver):
         self.engaged = False
         self._fault: Fault | None = None
         """Fault of a motor; kept until recover()."""
-        self._following = [
-            min(settings.following_limit, _PUSHING * motor.limits.torque / motor.kp) if motor.kp > 0.0 else inf
-            for motor in settings.motors
+        torques = spec.limits.torque or [motor.limits.torque for motor in settings.motors]
+        limits = [
+            min(settings.following_limit, _PUSHING * torque / motor.kp) if motor.kp > 0.0 else inf
+            for motor, torque in zip(settings.motors, torques, strict=True)
         ]
-        """Largest distance of each joint from its set-point, rad."""
+        self._following = Following([motor.label for motor in self._motors], limits)
         friction = [motor.friction for motor in settings.motors]
         self._friction = friction if any(friction) else None
         zeros = (0.0,) * len(self._motors)
@@ -75,6 +79,8 @@ class DamiaoArm(RobotDriver):
         self._dq_sent: Sequence[float] = zeros
         self._tau_sent: Sequence[float] | None = None
         """Torques of the last set-point; None in position mode."""
+        self._goal: list[float] | None = None
+        """Position that was measured since a fault or a loss, to which the target goes slowly, rad; None otherwise."""
         self._holds: list[bytes] | None = None
         """Commands that hold the target at rest; None until they are computed for it."""
         self._written = False
@@ -82,6 +88,8 @@ class DamiaoArm(RobotDriver):
         self._switching: ChainMotor | None = None
         """The motor that is being switched on."""
         self._attempts = 0
+        self._limp: list[ChainMotor] = []
+        """Motors that did not switch on."""
         self._t_switched = 0.0
         self._now = 0.0
         self._seq = 0
@@ -93,12 +101,21 @@ class DamiaoArm(RobotDriver):
     # Connection.
 
     def open(self) -> None:
-        """Connect, and compare the registers of every motor with the rig. Nothing moves or is switched on."""
+        """Connect, and compare the motors' registers and positions with the rig. Nothing moves or is switched on.
+
+        Raises:
+            RobotFault: A motor is full turns away from its joint's range; names it.
+        """
         self.close()
         self._fault = None
         self._reading = None
         self._written = False
+        self._limp.clear()
         self.chain.open()
+        turned = find_turned(self._motors, self.spec.limits)
+        if turned is not None:
+            self.chain.close()
+            raise RobotFault(turned.cause, turned.remedy, code=turned.code)
 
     def close(self) -> None:
         """Let an arm that is engaged sink slowly until it rests; switch it off and disconnect.
@@ -163,42 +180,48 @@ class DamiaoArm(RobotDriver):
         on = True
         for motor in self._motors:
             on = on and motor.on
-        if chain.lost is None and (self._fault is None or self._fault.code in MILD_FAULTS):
+        if chain.lost is None and not self._stopped:
             self._fault = self._find_fault(on) or self._fault
+        if chain.lost is not None or self._stopped:
+            self._yield()
         if in_use and (chain.lost is not None or (self.engaged and not on)):
             self.engaged = False
             self._switching = None
+
+    @property
+    def _stopped(self) -> bool:
+        """Whether a fault stops the arm at once, so that no set-point is passed on."""
+        return self._fault is not None and self._fault.code not in MILD_FAULTS
+
+    def _yield(self) -> None:
+        """Let the arm hold where it is measured, so that no joint pushes on; again where one is pushed far away."""
+        q = [motor.q for motor in self._motors]
+        goal = self._goal = self._goal or q
+        for k, limit in enumerate(self._following.limits):
+            if abs(goal[k] - q[k]) > limit:
+                goal[k] = q[k]
 
     def _find_fault(self, on: bool) -> Fault | None:
         """Return the gravest fault; ``on`` is whether all motors are on."""
         fault = self.chain.fault(engaged=self.engaged)
         if fault is not None and fault.code not in MILD_FAULTS:
             return fault
-        grave = self._check_following()
+        grave = self._check_following() if self.engaged else find_turned(self._motors, self.spec.limits)
         if grave is None and self.engaged and not on:
             off = next(motor for motor in self._motors if not motor.on)
             grave = Fault(
                 "switched_off",
-                f"{off.label} is off, though nothing here switched it off",
+                f"{off.label} is off, though nothing here switched it off: this joint falls",
                 "support the arm; check its power supply, and whether another program drives it; compare the "
                 "joint with its picture, because a restart may shift a motor's zero",
             )
         return grave or fault
 
     def _check_following(self) -> Fault | None:
-        """Return a fault, and hold the measured position, if a joint is too far from its set-point."""
-        if not self.engaged or self._tau_sent is not None:
+        """Return a fault if a joint is too far from its set-point."""
+        if self._tau_sent is not None:
             return None
-        for motor, target, limit in zip(self._motors, self._target, self._following, strict=True):
-            if abs(motor.q - target) > limit:
-                self._target = [motor.q for motor in self._motors]
-                self._holds = None
-                return Fault(
-                    "not_following",
-                    f"{motor.label} is {abs(motor.q - target):.2f} rad away from its set-point",
-                    "check what the arm touches, and its load (`payload` in the rig)",
-                )
-        return None
+        return self._following.check(self._now, [motor.q for motor in self._motors], self._target, self._dq_sent)
 
     def _send_idle(self) -> None:
         """Send what keeps the arm as it is: the hold to motors that are on, a request for its state to each other."""
@@ -220,10 +243,14 @@ class DamiaoArm(RobotDriver):
 
     def _hold_commands(self) -> list[bytes]:
         """Return the commands that hold the target at rest, with the torques that carry the arm's weight there."""
-        if self._holds is not None and self.engaged:
+        goal = self._target if self._goal is None else self._goal
+        if self._holds is not None and self.engaged and self._target == goal:
             return self._holds
-        motors = self._motors
-        self._target = [q if motor.on else motor.q for q, motor in zip(self._target, motors, strict=True)]
+        motors, step = self._motors, _YIELDING / self.spec.rate_hz
+        self._target = [q + min(max(end - q, -step), step) for q, end in zip(self._target, goal, strict=True)]
+        for k, motor in enumerate(motors):
+            if not motor.on:
+                self._target[k] = goal[k] = motor.q
         tau = self._weight(self._target)
         self._holds = [
             motor.command(self._target[k], 0.0, motor.kp, motor.kd, tau[k]) for k, motor in enumerate(motors)
@@ -241,7 +268,7 @@ class DamiaoArm(RobotDriver):
         chain, motors = self.chain, self._motors
         if chain.lost is not None or chain.bus is None:
             raise chain.lost or ConnectionLost(f"{self.spec.name} is not open", code="closed")
-        if not self.engaged or (self._fault is not None and self._fault.code not in MILD_FAULTS):
+        if not self.engaged or self._stopped:
             return False
         q, dq = setpoint.q, setpoint.dq
         if setpoint.tau is None:
@@ -263,7 +290,7 @@ class DamiaoArm(RobotDriver):
             chain.send(motor, frame)
         self._written = True
         self._target, self._dq_sent, self._tau_sent = list(q), dq, setpoint.tau
-        self._holds = None
+        self._holds = self._goal = None
         self.cycle_times.add(time.perf_counter() - began + self._reading_took)
         return True
 
@@ -295,15 +322,19 @@ class DamiaoArm(RobotDriver):
             elif self._now - self._t_switched < SWITCHING:
                 return
         if motor is None:
-            motor = next((one for one in self._motors if not one.on), None)
+            motor = next((one for one in self._motors if not one.on and one not in self._limp), None)
             self._attempts = 0
         if motor is None:
+            if self._limp:
+                self._give_up()
             self.engaged = True
             self._dq_sent, self._tau_sent = self._zeros, None
             return
         self._attempts += 1
-        if self._attempts > _ATTEMPTS:
-            self._give_up(motor)
+        if self._attempts > _ATTEMPTS:  # the others come first: they hold what can be held
+            motor.on, self._switching = False, None
+            self._limp.append(motor)
+            return
         self._switch_on(motor)
 
     def _switch_on(self, motor: ChainMotor) -> None:
@@ -311,30 +342,34 @@ class DamiaoArm(RobotDriver):
         motor.on = False  # so that it holds where it is measured
         hold = self._hold_commands()[self._motors.index(motor)]
         self._switching, self._t_switched = motor, self._now
-        self.chain.switch_on(motor, hold)
+        self.chain.switch_on(motor, hold, self._attempts == 1)
 
-    def _give_up(self, motor: ChainMotor) -> None:
+    def _give_up(self) -> None:
         """Raise RobotFault for a motor that does not switch on; those that are on continue to hold."""
-        self._switching = None
-        motor.on = False
+        motor = self._limp[0]
+        self._limp.clear()
+        fault = motor_fault(motor, self.settings.mosfet_limit, engaged=True)
+        why = "" if fault is None else f" ({fault.cause.removeprefix(f'{motor.label}: ')})"
         raise RobotFault(
-            f"{self.spec.name}: {motor.label} does not switch on (status {motor.status:x}); the others hold",
+            f"{self.spec.name}: {motor.label} does not switch on{why}; the others hold",
             "support the arm, since this joint is limp; check the motor's power supply; closing the rig lowers the arm",
             code="not_switched_on",
         )
 
     def recover(self) -> None:
-        """Clear the errors of motors that apply no torque. Nothing is switched on, and no motor lets go.
+        """Acknowledge a fault. No motor gets a command: the next session clears its error and switches it on at once.
 
         Raises:
-            RobotFault: An error stays, or a motor is still too hot; names the motor.
+            RobotFault: A motor is still too hot, or still gets another program's commands; names the motor.
             ConnectionLost: The arm does not answer.
         """
-        self.chain.clear_errors()
+        self.chain.usable  # noqa: B018  # raises while there is no connection
+        self.chain.acknowledge_errors()
         fault = self.chain.fault(engaged=False)
         if fault is not None:
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
         self._fault = None
+        self._limp.clear()
 
     # Model and statistics.
 

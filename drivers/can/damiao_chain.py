@@ -14,17 +14,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalError, Problem, RobotFault
+from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalError, Problem
 from hal.lock import DeviceLock
 
-from .bus import CanBus
+from .bus import CanBus, describe_losses
 from .damiao_motor import CHECKED_REGISTERS, HEAT_MARGIN, MILD_FAULTS, ChainMotor, motor_fault, register_problems
 from .damiao_protocol import (
     CLEAR_ERROR,
     DISABLE,
     ENABLE,
     REGISTER_ID,
-    MotorStatus,
     encode_register_read,
 )
 from .settings import BusSettings, DamiaoMotorSettings, emulator_remedy, is_emulated
@@ -48,8 +47,6 @@ _ROUND = 0.01
 """Longest time to wait for the answers of one round of requests, s."""
 _LOCK_PATIENCE = 2.0
 """Longest time to wait for another program to release the motors, s."""
-_CLEARING = 0.03
-"""Longest time until an error is cleared, s. Meanwhile the other motors hear nothing: it is below every TIMEOUT."""
 _LOWERING = 6.0
 """Longest time that an arm is lowered before it is left to the damping of its motors, s."""
 _SINKING = 0.4
@@ -148,7 +145,7 @@ class DamiaoChain:
             for motor in self.motors:
                 motor.registers.clear()
                 motor.on, motor.replies, motor.asked, motor.silent, motor.gap, motor.t = False, 0, 0, 0, 0, -1.0
-                motor.unasked = 0.0
+                motor.unasked, motor.acknowledged = 0.0, 0
             self._read_registers(bus)
             problems = [problem for motor in self.motors for problem in self._problems(motor)]
             if problems:
@@ -399,42 +396,22 @@ class DamiaoChain:
             mild = Fault("other_program", cause, "end the other program, on any computer on this bus")
         return mild
 
-    def clear_errors(self) -> None:
-        """Clear the errors of all motors that have one and apply no torque; those stay without. Takes up to 30 ms.
-
-        A motor that lost communication damps, and carries a part of the arm by that. Cleared it would be off, and the
-        arm would fall: :meth:`switch_on` clears it together with its first command.
-
-        Raises:
-            RobotFault: An error stays; names the motor.
-            ConnectionLost: The chain does not answer.
-        """
-        bus = self.usable
-        deadline = time.monotonic() + _CLEARING
-        while wrong := [m for m in self.motors if m.status > 1 and m.status != MotorStatus.LOST_COMMUNICATION]:
-            if time.monotonic() > deadline:
-                fault = self.fault(engaged=True)
-                assert fault is not None
-                raise RobotFault(fault.cause, fault.remedy, code=fault.code)
-            for motor in wrong:
-                self.send(motor, CLEAR_ERROR)
-                self.ask_state(motor)
-            time.sleep(0.002)
-            bus.poll()
-            for motor in wrong:
-                if motor.replies:
-                    motor.decode()
-                    motor.replies = 0
+    def acknowledge_errors(self) -> None:
+        """Count the errors that motors report as none until they are switched on, which clears them."""
         for motor in self.motors:
-            motor.asked = 0
+            motor.acknowledged = motor.status
 
-    def switch_on(self, motor: ChainMotor, hold: bytes) -> None:
-        """Switch a motor on and give it its first command at once, so that nothing sags in between."""
-        if motor.status > 1:
+    def switch_on(self, motor: ChainMotor, hold: bytes, first: bool) -> None:
+        """Switch a motor on and give it its first command at once, so that nothing sags in between.
+
+        Only the ``first`` attempt clears an error. Later ones may meet a motor that is on, whose answers are late: it
+        would let go.
+        """
+        if motor.status > 1 and first:
             self.send(motor, CLEAR_ERROR)
         self.send(motor, ENABLE)
         self.send(motor, hold)
-        motor.on, motor.switched_at = True, self._now
+        motor.on, motor.switched_at, motor.acknowledged = True, self._now, 0
 
     def lower(self, weight: Weight | None = None) -> None:
         """Do all steps of :meth:`lower_further`, and wait in between."""
@@ -522,7 +499,9 @@ class DamiaoChain:
         afterwards; ``doubled`` replies came twice; ``unexpected`` frames have an id that no device on the bus has.
         """
         motors = self.motors
+        lost = sum(motor.missing - motor.late for motor in motors)
         return {
+            "warnings": describe_losses(self.name, self.settings.channel, lost, self.cycles * len(motors)),
             "cycles": self.cycles,
             "incomplete": self.incomplete,
             "missing": sum(motor.missing for motor in motors),

@@ -234,7 +234,8 @@ class DamiaoGripper(GripperDriver):
             return
         self._ramp = motor.q
         self._closed, self._turn = False, self.table.width(motor.q)
-        self.chain.switch_on(motor, motor.command(self._ramp, 0.0, motor.kp, motor.kd, 0.0))
+        hold = motor.command(self._ramp, 0.0, motor.kp, motor.kd, 0.0)
+        self.chain.switch_on(motor, hold, self._attempts == 1)
 
     def _report(self, now: float) -> GripperReading:
         motor, table = self._motor, self.table

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from math import pi
 
 from hal.errors import Fault
+from hal.specs import LimitsSpec
 
 from .damiao_protocol import (
     MIT_MODE,
@@ -19,7 +21,15 @@ from .damiao_protocol import (
 )
 from .settings import DamiaoMotorSettings
 
-__all__ = ["CHECKED_REGISTERS", "HEAT_MARGIN", "MILD_FAULTS", "ChainMotor", "motor_fault", "register_problems"]
+__all__ = [
+    "CHECKED_REGISTERS",
+    "HEAT_MARGIN",
+    "MILD_FAULTS",
+    "ChainMotor",
+    "find_turned",
+    "motor_fault",
+    "register_problems",
+]
 
 CHECKED_REGISTERS = (
     MotorRegister.PMAX,
@@ -39,6 +49,8 @@ HEAT_MARGIN = 5.0
 MILD_FAULTS = frozenset({"motor_hot", "other_program"})
 """Codes of the faults with which every motor still follows its commands, so that the arm can be braked."""
 
+_SLACK = 0.3
+"""How far beyond its joint's range a motor may report itself at rest, rad."""
 _HOT = "let it cool down, with the arm supported; lower its load or its speed"
 _STATUS_FAULTS = {
     MotorStatus.OVER_VOLTAGE: ("its supply voltage is too high", "check the power supply, also while braking"),
@@ -86,6 +98,8 @@ class ChainMotor:
         """Whether this program switched the motor on, and it still is on as far as its replies tell."""
         self.switched_at = 0.0
         """Time of that, s on the host's clock."""
+        self.acknowledged = 0
+        """The error that :meth:`.DamiaoArm.recover` acknowledged: it no longer is a fault."""
         self.status = 0
         self.q = self.dq = self.tau = 0.0
         """Position, velocity and torque of the joint, rad, rad/s and Nm."""
@@ -158,7 +172,7 @@ def motor_fault(motor: ChainMotor, mosfet_limit: float, *, engaged: bool) -> Fau
         engaged: Whether the motor is in use. One that is not may have lost communication: that is its rest.
     """
     status = motor.status
-    if status > 1 and (engaged or status != MotorStatus.LOST_COMMUNICATION):
+    if status > 1 and status != motor.acknowledged and (engaged or status != MotorStatus.LOST_COMMUNICATION):
         if status in _STATUS_FAULTS:
             cause, remedy = _STATUS_FAULTS[MotorStatus(status)]
             return Fault(MotorStatus(status).name.lower(), f"{motor.label}: {cause}", f"{_SUPPORT}; {remedy}")
@@ -170,6 +184,21 @@ def motor_fault(motor: ChainMotor, mosfet_limit: float, *, engaged: bool) -> Fau
     if motor.mosfet >= mosfet_limit - HEAT_MARGIN:
         what = f"its electronics have {motor.mosfet} deg C; at {mosfet_limit:g} they switch off"
         return Fault("motor_hot", f"{motor.label}: {what}", _HOT)
+    return None
+
+
+def find_turned(motors: Sequence[ChainMotor], limits: LimitsSpec) -> Fault | None:
+    """Return the fault of the first motor that reports full turns away from its joint's range; None without one."""
+    for motor, low, high in zip(motors, limits.lower, limits.upper, strict=True):
+        turns = round((0.5 * (low + high) - motor.q) / (2.0 * pi))
+        really = motor.q + 2.0 * pi * turns
+        if low - _SLACK <= really <= high + _SLACK and not low - _SLACK <= motor.q <= high + _SLACK:
+            cause = f"reports {motor.q:.2f} rad, out of its range of {low:g} to {high:g} by {abs(turns)} full turn(s)"
+            remedy = (
+                "it was more than half a turn from its zero when it got power: support the arm, switch it off, turn "
+                "the joint to the middle of its range, and switch it on again; if that does not help, correct `offset`"
+            )
+            return Fault("full_turn", f"{motor.label}: {cause}", remedy)
     return None
 
 

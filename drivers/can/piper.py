@@ -10,21 +10,25 @@ nothing is lost when a program stops to send, and nothing here ever switches its
 
 from __future__ import annotations
 
-from math import inf
+from math import dist, inf
 from typing import Any, ClassVar
 
 from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import ConnectionLost, Fault
+from hal.following import Following
 from hal.lock import DeviceLock
 from hal.specs import RobotSpec
 
+from .bus import describe_losses
 from .piper_link import FRESH_READS, SILENCE, PiperLink, arm_fault, control_fault, join_joints, refusal
 from .piper_protocol import (
     ACKNOWLEDGEMENT,
+    CAN_CONTROL,
     ENABLED,
     FEEDBACK_IDS,
     GRIPPER_IDS,
     JOINTS,
+    MOVE_J,
     TORQUE_PER_AMPERE,
     EnableRequest,
     JointAngles,
@@ -51,8 +55,11 @@ _SLOW_SILENCE = 0.5
 _CLEARING = 0.12
 """Longest time until an error is cleared, s."""
 _OWN_IDS = (*(id for id in FEEDBACK_IDS if id not in GRIPPER_IDS), ACKNOWLEDGEMENT)
-_FOLLOWING = 0.3
-"""Largest distance of a joint from its target, rad. Beyond it the arm does not get its targets, or is too slow."""
+_FOLLOWING, _LAG = 0.05, 0.1
+"""Largest distance of a joint from its target, rad, and by how much it may be larger for each rad/s of the target, s.
+Beyond it the arm is blocked, does not get its targets, or is too slow."""
+_AWAY = 0.02
+"""An arm that is no longer driven, and this far from its last target, is told to stay where it is, rad."""
 _OTHERS_CONTROL = frozenset({2, 5, 6, 7})
 """Control modes in which the arm is moved by a hand, a leader arm or a recorded trajectory (see PiperStatus)."""
 _NO_COMMANDS = Fault("no_commands", "the bus takes no commands", "check the adapter and its cable")
@@ -70,6 +77,8 @@ class PiperArm(RobotDriver):
         self.settings = PiperArmSettings.of(spec)
         self.engaged = False
         self._link = PiperLink(spec.name, self.settings, self._take, _OWN_IDS, spec.source)
+        joints = [join_joints([k]) for k in range(JOINTS)]
+        self._following = Following(joints, [_FOLLOWING] * JOINTS, _LAG)
         self._lock: DeviceLock | None = None
         self.longest_gap = 0.0
         """Longest time between two samples, s."""
@@ -97,12 +106,14 @@ class PiperArm(RobotDriver):
         self._moving: set[int] = set()
         """Joints whose speed has been reported."""
         self._pairs: list[tuple[float, float]] = [(0.0, 0.0)] * 3
-        self._pairs_come = 0
+        self._pairs_come = self._incomplete = 0
+        """Which of the three frames of a sample have come, and samples that lacked one."""
         self._t_pairs = -inf
         self._commanded: tuple[float, ...] | None = None
+        """The last target that it got, rad; also after a fault or a loss, since the arm still goes there."""
         self._commanded_dq: tuple[float, ...] = _NO_JOINTS
-        self._held: tuple[float, ...] | None = None
-        """Measured position that the arm holds since it did not follow, rad; None otherwise."""
+        self._holding = False
+        """Whether that is a position that was measured after a fault or a loss."""
         self._fault: Fault | None = None
         """Error that ended the engagement; kept until recover(), even if the arm no longer reports it."""
         self._t_asked = self._t_engaging = self._t_last_try = -inf
@@ -204,6 +215,7 @@ class PiperArm(RobotDriver):
         elif type(record) is JointAngles:
             k = record.first // 2
             if k == 0:  # the arm sends them in order: a set that lacks one is dropped
+                self._incomplete += self._pairs_come > 0
                 self._t_pairs, self._pairs_come = self._now, 0
             self._pairs[k] = record.q
             self._pairs_come |= 1 << k
@@ -231,29 +243,30 @@ class PiperArm(RobotDriver):
             fault = fault or control_fault(status, self._flags) or self._check_following()
             if fault is not None:
                 self._fault = fault
-                self._held = self._q if fault.code == "not_following" else None
                 self._disengage()
                 self.faults += 1
         return self._fault or fault
 
     def _hold_measured(self) -> None:
-        """Command an arm that did not follow to stay where it was: it neither pushes on nor leaps once it is free."""
-        status = self._status
+        """Tell an arm that stopped before its target to stay: it neither pushes on nor leaps once it is free."""
+        status, q, target = self._status, self._q, self._commanded
         assert status is not None
-        if self._fault is None or status.control in _OTHERS_CONTROL:
-            self._held = None
-        elif self._held is not None:
-            self._link.send(encode_joint_targets(self._held))
+        if self.engaged or q is None or target is None:
+            return
+        if status.control != CAN_CONTROL or status.move != MOVE_J:
+            return
+        if dist(q, target) > _AWAY:
+            self._commanded, self._holding = q, True
+        if self._holding:
+            self._link.send(encode_joint_targets(self._commanded or q))
 
     def _check_following(self) -> Fault | None:
         """Return a fault if a joint is too far from its target: the arm would race there as soon as it can."""
         if self._commanded is None or self._q is None:
             return None
-        for k, (target, q) in enumerate(zip(self._commanded, self._q, strict=True)):
-            if abs(target - q) > _FOLLOWING:
-                cause = f"{join_joints([k])} is {abs(target - q):.2f} rad away from its target"
-                return Fault("not_following", cause, "check what the arm touches, and `speed_percent` in the rig")
-        return None
+        fault = self._following.check(self._now, self._q, self._commanded, self._commanded_dq)
+        remedy = "check what the arm touches, and `speed_percent` in the rig"
+        return None if fault is None else Fault(fault.code, fault.cause, remedy)
 
     def write(self, setpoint: Setpoint) -> bool:
         if not self.engaged:
@@ -299,7 +312,7 @@ class PiperArm(RobotDriver):
             raise refusal(self.spec.name, control_fault(status, [ENABLED] * JOINTS) or _NO_COMMANDS)
         fault = control_fault(status, self._flags)
         if fault is None and self._confirmed and self._t_status > self._t_asked:
-            self.engaged, self._blocked_since = True, None
+            self.engaged, self._holding, self._blocked_since = True, False, None
             return
         if now - self._t_engaging > _SWITCHED_ON:
             raise refusal(self.spec.name, fault or _NO_COMMANDS)
@@ -316,7 +329,7 @@ class PiperArm(RobotDriver):
         self._commanded, self._commanded_dq = q, _NO_JOINTS
 
     def _disengage(self) -> None:
-        self.engaged, self._commanded, self._t_last_try = False, None, -inf
+        self.engaged, self._t_last_try = False, -inf
 
     def recover(self) -> None:
         """Clear the errors of the joints. It never sends the vendor's reset, which cuts the power of the motors.
@@ -346,9 +359,12 @@ class PiperArm(RobotDriver):
 
     def statistics(self) -> dict[str, Any]:
         joints = [joint for joint in self._joints if joint is not None]
+        lost, channel = self._incomplete, self.settings.channel
         return {
+            "warnings": describe_losses(self.spec.name, channel, lost, 3 * (self._seq + lost)),
             "bus": self._link.statistics(),
             "samples": self._seq,
+            "incomplete": lost,
             "longest_gap_s": self.longest_gap,
             "faults": self.faults,
             "motor_temperatures": [joint.motor_temperature for joint in joints],

@@ -17,7 +17,7 @@ from hal.specs import RobotSpec
 
 from .bus import CanBus, bring_up
 from .damiao_chain import DamiaoChain
-from .damiao_motor import register_problems
+from .damiao_motor import find_turned, register_problems
 from .damiao_protocol import REGISTER_ID, TIMEOUT_UNIT, MotorRegister, encode_register_read
 from .interfaces import CanInterface, read_interfaces
 from .piper_link import PiperLink, arm_fault, gripper_fault
@@ -213,6 +213,9 @@ def check_damiao(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
     try:
         if (yield from _check_motors(chains, bus)):
             yield from _check_states(chains)
+            turned = find_turned(chains[0].motors, spec.limits)
+            if turned is not None:
+                yield CheckResult("position", "fail", turned.cause, turned.remedy)
             yield _check_firmware(chains)
             yield from _measure_answers(chains, spec.rate_hz, duration)
     finally:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import CommandError, ConnectionLost, Fault
+from hal.following import Following
 from hal.specs import RobotSpec
 
 from .world import SimulatedWorld
@@ -16,6 +17,8 @@ __all__ = ["SimulatedRobot"]
 
 HOLD_TIME = 0.020
 """Time for which torques are held without new ones, s: the same as a Franka's."""
+FOLLOWING, PATIENCE = 0.1, 0.1
+"""A joint that is farther from its set-point than this, rad, for longer than this, s, does not follow."""
 
 Floats = Sequence[float]
 W = TypeVar("W", bound=SimulatedWorld)  # type: ignore[type-arg]  # of any kind of body
@@ -28,6 +31,8 @@ class SimulatedRobot(RobotDriver, Generic[W]):
     written the arm is there, so the next reading has no lag, and the arm does not sag. The motors' torques are limited
     to those of the rig, or of the URDF where the rig has none, and their speeds too, so that a set-point that jumps
     cannot move a joint faster.
+
+    A joint that something keeps away from its set-point is a fault, as on a real arm: the arm then holds where it is.
 
     A set-point with torques switches the motors off, and adds its torques to the compensation of gravity; one without
     switches them on again. The last torques are held for 20 ms without new ones, then the motors hold the arm.
@@ -49,6 +54,10 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         self._frozen: Reading | None = None
         self._freeze = False
         self._fault: Fault | None = None
+        """The injected fault."""
+        self._following = Following(spec.joints, [FOLLOWING] * len(spec.joints), patience=PATIENCE)
+        self._away: Fault | None = None
+        """The fault of a joint that does not follow; kept until recover()."""
         self._q: Floats | None = None
         self._dq: Floats | None = None
         self._tau: Floats | None = None
@@ -102,7 +111,12 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         if self._freeze and self._frozen is not None:
             return self._frozen
         q, dq, tau = self._state()
-        fault = self._fault or world.fault
+        if self._tau is None and self._q is not None and self._dq is not None and world.fault is None:
+            away = self._following.check(world.t, q, self._q, self._dq)
+            if away is not None:
+                self._away = self._away or away
+                self._hold(q)
+        fault = self._fault or self._away or world.fault
         reading = Reading(now, world.t, world.steps, q, dq, tau, self._q, self._dq, None, None, fault)
         self._frozen = reading
         return reading
@@ -111,7 +125,7 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         """Apply a set-point; a robot with a fault ignores it, which its ``q_commanded`` shows."""
         if not self._open or not self._connected:
             raise self._lost()
-        if self._fault is not None:
+        if self._fault is not None or self._away is not None:
             return
         q, dq, tau = setpoint.q, setpoint.dq, setpoint.tau
         if tau is not None:
@@ -138,8 +152,10 @@ class SimulatedRobot(RobotDriver, Generic[W]):
             self._hold(self._q if self._tau is None else self._positions())
 
     def recover(self) -> None:
-        """Clear every injected fault."""
-        self._connected, self._freeze, self._fault = True, False, None
+        """Clear every fault; an arm that did not follow holds where it is."""
+        if self._away is not None:
+            self._hold(self._positions())
+        self._connected, self._freeze, self._fault, self._away = True, False, None, None
 
     def inject(self, **faults: object) -> None:
         """Switch injected faults on or off.
@@ -196,8 +212,11 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         self._frozen = None
         self._q, self._dq, self._tau = state["q"], state["dq"], state["tau"]
         self._received = self._world.steps - state["age"]
+        self._away = None
+        self._following.forget()
 
     def _was_reset(self) -> None:
         self._frozen = None
         self._q, self._dq = self._positions(), [0.0] * len(self.spec.joints)
-        self._tau = None
+        self._tau = self._away = None
+        self._following.forget()

@@ -25,7 +25,7 @@ from ..camera import Camera
 from ..commands import FIRST_STEP_ANGLE, CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Twist
 from ..control import Control
 from ..deadman import Deadman
-from ..errors import CommandError, DriverMissing, MotionStopped, NotSupported
+from ..errors import CommandError, DriverMissing, MotionStopped, NotSupported, RobotFault
 from ..geometry import Pose, after_rotation
 from ..observation import Observation
 from ..rig import Rig, open_rig
@@ -501,8 +501,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             first += arm.size
             try:
                 arm.control.send(command, grip=grip)
-            except MotionStopped as stop:
-                stopped = stopped or (f"{arm.robot.name}: {stop.reason}" if len(self._arms) > 1 else stop.reason)
+            except (MotionStopped, RobotFault) as stop:
+                reason = stop.reason if isinstance(stop, MotionStopped) else stop.cause
+                stopped = stopped or (f"{arm.robot.name}: {reason}" if len(self._arms) > 1 else reason)
         now = clock.now()
         self._due = max(self._due + 1.0 / self._rate, now)  # a late turn is not caught up
         clock.sleep_until(self._due)

@@ -103,6 +103,43 @@ def test_reset_puts_an_arm_somewhere_and_a_session_goes_on_from_there(rig: hal.R
         assert arm.state().q == pytest.approx(arm.home, abs=2e-3)
 
 
+def test_an_arm_that_is_pushed_off_its_set_point_is_a_fault_holds_where_it_is_and_recovers(rig: hal.Rig) -> None:
+    arm = rig.robots["panda"]
+    still = hal.JointVelocity([0.0] * 7)
+    with arm.control(rate_hz=50) as control:
+
+        def hold(seconds: float, command: hal.JointVelocity = still) -> None:
+            for _ in range(round(seconds * 50)):
+                control.send(command)
+                rig.clock.sleep(0.02)
+
+        def push(force: float) -> None:
+            at = (arm.base @ arm.state().tcp).position
+            rig.world.apply_force("panda", [0.0, force, 0.0], at, link="panda_hand", duration=0.3)
+
+        push(30.0)
+        hold(0.5)
+        assert arm.state().q == pytest.approx(arm.home, abs=1e-3)
+        push(100.0)
+        with pytest.raises(hal.RobotFault):
+            hold(0.3)
+        rig.clock.sleep(0.4)
+        at = arm.state().q
+        rig.clock.sleep(0.2)
+        state = arm.state()
+        assert state.fault is not None
+        assert state.fault.code == "not_following"
+        assert state.q == pytest.approx(at, abs=1e-3)
+        assert np.abs(state.q - arm.home).max() > 0.1
+        arm.recover()
+        rig.clock.sleep(0.02)
+        control.rearm()
+        hold(0.5)
+        assert arm.state().q == pytest.approx(state.q, abs=1e-3), "it does not go back by itself"
+        hold(0.5, hal.JointVelocity([0.2] + [0.0] * 6))
+        assert arm.state().q[0] > state.q[0] + 0.02
+
+
 def test_dynamics_are_read_back_and_restored(rig: hal.Rig) -> None:
     before = rig.world.dynamics("cube")
     with rig.world.changed_dynamics("cube", lateral_friction=0.05, spinning_friction=0.02, mass=1.0):

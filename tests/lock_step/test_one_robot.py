@@ -136,9 +136,9 @@ def test_arms_driven_at_each_other_stop_apart(robots: Rig, engine: Engine) -> No
 
 def test_unguarded_arms_of_one_robot_hold_each_other_up(robots: Rig, engine: Engine) -> None:
     with open_rig(robots, engine, collisions={"arms": False, "self": False}) as rig:
-        drive_together(rig)
+        with pytest.raises(hal.RobotFault):  # neither gets where it is sent
+            drive_together(rig)
         touching = rig.world.contacts("left", "right")
-        assert max(contact.force for contact in touching) > 1.0
         assert min(contact.distance for contact in touching) > -0.01
 
 

@@ -6,7 +6,9 @@ import time
 
 import pytest
 from can_kit import EmulatorProcess
+from waiting import wait_until
 
+import hal
 from hal.drivers.can.emulator.__main__ import main
 
 
@@ -25,6 +27,18 @@ def test_commands_are_typed_at_the_prompt_or_sent_to_the_control_port() -> None:
             emulator.execute("lose")
         assert emulator.execute("kill") == {}
         assert emulator.process.wait(5.0) != 0
+
+
+@pytest.mark.parametrize("name", ["yam", "piper"])
+def test_a_program_is_warned_of_lost_frames_at_its_end(name: str) -> None:
+    with (
+        EmulatorProcess(name) as emulator,
+        pytest.warns(RuntimeWarning, match="frames on .* were lost"),
+        hal.open(name, sim=False, pad="none", overrides=emulator.overrides) as rig,
+    ):
+        emulator.execute("lose 0.05")
+        (group,) = rig.statistics()
+        wait_until(lambda: rig.statistics()[group]["robots"]["arm"]["driver"]["warnings"], "lost")
 
 
 def test_a_rig_without_a_can_arm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

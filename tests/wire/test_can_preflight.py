@@ -49,6 +49,14 @@ def test_an_arm_in_order_passes_every_check(rig: str) -> None:
         assert far.arm.plant.held  # no motor was ever switched on
 
 
+def test_a_motor_a_full_turn_away_fails_by_joint_and_motor() -> None:
+    with emulated_arm("yam") as far:
+        far.execute("place 0 -4.78 1.35 -1.42 0 0")
+        (failed,) = wrong(results(far.spec))
+        assert failed.name == "position"
+        assert "joint2 (motor 2)" in failed.found
+
+
 @pytest.mark.parametrize("rig", ["yam", "piper"])
 def test_a_bus_without_a_motor_fails(rig: str) -> None:
     failed = wrong(results(absent(rig)))

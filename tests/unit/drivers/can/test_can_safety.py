@@ -228,19 +228,6 @@ def test_a_time_out_that_is_too_short_or_too_long_is_refused(yam: Bench, seconds
     assert found == ([code] if code else [])
 
 
-def test_clearing_an_error_that_stays_lets_no_other_motor_time_out(yam: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    for motor in yam.arm.motors.values():
-        motor.registers[MotorRegister.TIMEOUT] = round(0.05 / 50e-6)
-    driver = engaged_yam(yam)
-    motor = yam.arm.motors[1]
-    motor.status = MotorStatus.UNDER_VOLTAGE
-    yam.cycle(10)
-    monkeypatch.setattr(motor, "command", lambda data: None)
-    with pytest.raises(RobotFault):
-        driver.recover()
-    assert [yam.arm.motors[k].status for k in range(2, 7)] == [MotorStatus.ENABLED] * 5
-
-
 def test_a_gripper_whose_motor_restarts_does_not_go_on_by_itself(yam: Bench) -> None:
     yam.arm.gripper.q = yam.arm.gripper.upper
     driver = yam.open(DamiaoGripper(yam.spec.gripper))
@@ -344,6 +331,14 @@ def test_a_piper_that_gets_no_targets_does_not_race_to_a_far_one_later(piper: Be
     assert not driver.engaged
     piper.arm.take = take
     assert piper.fastest(0.5) < 0.01
+    before = piper.arm.commands
+    piper.cycle(5)
+    assert piper.arm.commands > before, "it is told to stay where it is"
+    piper.arm.control = 2  # a hand takes it over
+    piper.cycle(3)
+    before = piper.arm.commands
+    piper.cycle(5)
+    assert piper.arm.commands == before
 
 
 def test_a_piper_is_not_taken_over_while_a_hand_or_another_program_moves_it(piper: Bench) -> None:
