@@ -21,6 +21,7 @@ from ..arguments import number
 from ..commands import CHUNK_AHEAD, CHUNK_POINTS, FIRST_STEP_ANGLE, JointChunk
 from ..errors import ConfigError, NotSupported, PolicyError
 from ..histogram import Histogram
+from .policy import check_targets
 from .policy_config import Decoded, PolicyConfig, load_policy_config
 from .remote import PolicyClient, check_actions
 
@@ -145,7 +146,7 @@ class RemotePolicy:
         assert self._pending is not None
         reply, self._pending = self._pending.reply, None
         actions = check_actions(self._result(reply, longest), self._numbers)
-        self.config.decode(actions[:CHUNK_POINTS], observation, self._used)
+        self._decode(actions[:CHUNK_POINTS], observation)
         return None
 
     def reset(self, seed: int | None = None) -> None:
@@ -334,7 +335,7 @@ class RemotePolicy:
         # An arm that has stood still since the observation starts at the beginning, not where it would have been.
         start = now if self._chunk is None else observation.t
         actions = actions[: int((now - start + CHUNK_AHEAD) / self._dt) + 1]
-        decoded, steps = self.config.decode(actions, observation, self._used), len(actions)
+        decoded, steps = self._decode(actions, observation), len(actions)
         t: Array = start + self._dt * np.arange(first, first + steps, dtype=float)
         ahead = (t > now + _ONSET) & (t < now + CHUNK_AHEAD - self._dt)
         ahead[min(len(t), 2 * execute + int(np.argmax(ahead))) :] = False  # not for long after the server's death
@@ -352,6 +353,13 @@ class RemotePolicy:
             self._check_splice(self._chunk, chunk, now)
         self._chunk = chunk
         return {name: JointChunk(chunk.t, arm.q) for name, arm in targets.items()}
+
+    def _decode(self, actions: Array, observation: Observation) -> dict[str, Decoded]:
+        """Return the targets of each arm, all of them checked."""
+        decoded = self.config.decode(actions, observation, self._used)
+        for name, arm in decoded.items():
+            check_targets(self._used[name], self._dt * np.arange(len(actions), dtype=float), arm.q)
+        return decoded
 
     def _check_splice(self, old: _Chunk, new: _Chunk, now: float) -> None:
         """Refuse a chunk that begins farther away than an arm can be when its first target is due."""
