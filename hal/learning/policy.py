@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..commands import FIRST_STEP_ANGLE, Command, CommandChecks, JointChunk, JointVelocity
-from ..errors import CommandError, ConnectionLost, MotionStopped, PolicyError, RobotFault, StaleStateError
+from ..errors import CommandError, ConnectionLost, HalError, MotionStopped, PolicyError, RobotFault, StaleStateError
 from ..histogram import Histogram
 from ..observation import Observation
 from ..types import Trip
@@ -49,6 +49,8 @@ PolicyAnswer: TypeAlias = "ArmAnswer | Mapping[str, ArmAnswer]"
 
 PAST_LIMIT = 0.05
 """Greatest distance of a target past a joint's limit, rad; so little is noise, and cut off."""
+POLICY_STOPS = frozenset(trip.code for trip in (Trip.COMMAND_LATE, Trip.LIMIT, Trip.APP_SILENT, Trip.HOST_LATE))
+"""Codes of the stops that a policy causes, or a computer that is too slow for it; such an episode is a failure."""
 FIRST_ANSWER = 2.5
 """Time for a policy's first command of an episode or after a pause, s; the arm stands still until then."""
 
@@ -152,7 +154,8 @@ class PolicyOutcome:
     """Result of one episode."""
 
     success: bool | None
-    """Whether it succeeded; None if that is not known. False if time ran out before ``success`` was true."""
+    """Whether it succeeded; None if that is not known. False after an error or a stop of the policy's, or if time ran
+    out before ``success`` was true."""
     ended: str
     """``success``, ``failure`` (marked by the operator), ``time``, ``stopped`` or ``error``."""
     reason: str
@@ -169,11 +172,17 @@ class PolicyOutcome:
     inference: dict[str, float | None]
     """p50, p99 and max of the policy's time per call, s."""
     error: BaseException | None = None
-    """Error of the policy."""
+    """Error of the policy, or the stop."""
     statistics: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the policy's own, if it has any (see :meth:`.RemotePolicy.statistics`)."""
     interventions: tuple[tuple[float, float], ...] = ()
     """Begin and end of each time in which a person drove, s on ``rig.clock``."""
+
+    @property
+    def code(self) -> str:
+        """Name of the error or the stop: its ``code``, such as ``policy_lost``, or its type; else empty."""
+        error = self.error
+        return "" if error is None else error.code if isinstance(error, HalError) else type(error).__name__
 
 
 class PolicyRunner:
@@ -280,7 +289,7 @@ class PolicyRunner:
                     raise
         except (MotionStopped, RobotFault, ConnectionLost, StaleStateError) as stop:
             arms = f"{', '.join(stopped)}: " if stopped and len(controls) > 1 else ""
-            tally.end_as("stopped", arms + getattr(stop, "reason", str(stop)))
+            tally.end_as("stopped", arms + getattr(stop, "reason", str(stop)), stop)
         except _PolicyError as wrong:
             error = wrong.__cause__
             tally.end_as("error", f"{type(error).__name__}: {error}", error)
@@ -434,6 +443,8 @@ class _Tally:
 
     def outcome(self) -> PolicyOutcome:
         marks = {"success": True, "failure": False, "error": False, "time": False if self._judged else None}
+        if getattr(self._error, "code", "") in POLICY_STOPS:
+            marks["stopped"] = False
         return PolicyOutcome(
             success=marks.get(self._ended),
             ended=self._ended,
