@@ -67,8 +67,8 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="rollout",
         description="Run a policy under the limits and the dead-man of manual driving; count successes and record.",
-        epilog="Ctrl-C stops the arm. An episode that the policy ends by an error is a failure, and the next one follows; "
-        "on a real arm it takes a new press of the dead-man. The exit status is 1 if any episode ended so.",
+        epilog="Ctrl-C stops the arm. An episode that the policy ends by an error is a failure, and the next follows; "
+        "a real arm waits for a new press of the dead-man. The exit status is 1 if any episode ended so.",
     )
     add_rig_options(made)
     run = made.add_argument_group("running")
