@@ -139,6 +139,10 @@ class Decoded(NamedTuple):
     grip: Array | None
     """Grips (k,), 0 open to 1 closed; None if the policy does not move the gripper."""
 
+    def rows(self, which: Any) -> Decoded:
+        """Return the targets of these indices."""
+        return Decoded(self.q[which], None if self.grip is None else self.grip[which])
+
 
 class ActionConfig(Strict):
     """The meaning of a row of actions, or of the part of it that moves one of several arms."""
@@ -271,6 +275,8 @@ class PolicyConfig(Strict):
     """Rate of the policy's actions, Hz."""
     execute: Annotated[int, Field(ge=1, le=256)] | None = None
     """Actions of a chunk that are driven before those of the next one; None: half of the chunk."""
+    blend: Annotated[int, Field(ge=0, le=256)] = 6
+    """Steps over which the arm changes from one chunk to the next."""
     observation: dict[str, Source]
     """Key of the request -> where its value comes from."""
     action: ActionConfig | None = None
