@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot
+    from hal.servo.controllers import Controller
 
 ENDED_EARLY = 1
 LEROBOT = "lerobot:"
@@ -97,6 +98,13 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="moving a stick takes the arm from the policy, with the dead-man held; letting go gives it back",
     )
+    run.add_argument(
+        "--controller",
+        nargs="+",
+        metavar=("NAME", "GAIN=VALUE"),
+        help="what makes the arms follow: Position (default), JointImpedance or OperationalSpace, with their gains, for "
+        "example --controller OperationalSpace stiffness=[500,500,200] rotation_stiffness=30",
+    )
     add_episode_options(run)
     add_deadman_options(run)
     run.add_argument("--out", metavar="DIR", help="dataset to record into")
@@ -121,6 +129,7 @@ def _main(args: argparse.Namespace) -> int:
     if args.policy_config and not remote:
         raise CommandError("--policy-config is for a policy on a server: --policy ws://HOST:PORT")
     config = load_policy_config(args.policy_config) if args.policy_config else None
+    make_controller(args.controller)  # so that a mistake shows before anything is opened
     plan = resolve_plan(args, f"policy   {args.policy}")
     if plan is None:
         return 0
@@ -142,6 +151,31 @@ def _main(args: argparse.Namespace) -> int:
         finally:
             if recorder is not None:
                 recorder.close()
+
+
+def make_controller(words: list[str] | None) -> Controller | None:
+    """Return the controller of ``--controller``: the name of its class, then arguments of that as NAME=VALUE.
+
+    Raises:
+        CommandError: There is no such controller, or it does not take these arguments (code ``bad_controller``).
+    """
+    import yaml
+
+    from hal.errors import CommandError
+    from hal.servo.controllers import JointImpedance, OperationalSpace, Position
+
+    if words is None:
+        return None
+    kinds: dict[str, Any] = {kind.__name__: kind for kind in (Position, JointImpedance, OperationalSpace)}
+    name, *pairs = words
+    try:
+        gains = {key: yaml.safe_load(value) for key, _, value in (pair.partition("=") for pair in pairs)}
+        return kinds[name](**{key: tuple(gain) if isinstance(gain, list) else gain for key, gain in gains.items()})
+    except KeyError:
+        text = f"there is no controller {name!r}, only {', '.join(kinds)}"
+    except (TypeError, ValueError, yaml.YAMLError) as error:
+        text = f"{name} with {', '.join(pairs)}: {error}"
+    raise CommandError(f"--controller: {text}", code="bad_controller")
 
 
 def is_remote(policy: str) -> bool:
@@ -274,6 +308,7 @@ class RolloutRun:
             seconds=args.seconds,
             deadman=deadman,
             unattended=args.unattended or mapping is None,
+            controller=make_controller(args.controller),
             cameras=policy.config.cameras() if isinstance(policy, RemotePolicy) else None,
             history=args.history,
             success=load_object(args.success, "--success") if args.success else None,
@@ -394,8 +429,16 @@ class RolloutRun:
             "code": "" if outcome is None else outcome.code,
         }
 
+    def _following(self) -> dict[str, str]:
+        return {"controller": " ".join(self.args.controller)} if self.args.controller else {}
+
     def _info(self) -> dict[str, Any]:
-        return {"policy": self.args.policy, "robot": ",".join(self.robots), "rate_hz": self.args.rate}
+        return {
+            "policy": self.args.policy,
+            "robot": ",".join(self.robots),
+            "rate_hz": self.args.rate,
+            **self._following(),
+        }
 
     def _reset(self, number: int, seed: int) -> None:
         """Reset the scene: real arms drive home, and the seed places objects with random ranges."""
@@ -458,6 +501,7 @@ class RolloutRun:
             "backend": self.robot.spec.driver,
             "clock": self.rig.plan.clock,
             "rate_hz": self.args.rate,
+            **self._following(),
             "recorded": self.args.out,
             "ended": ended,
             "reasons": self._reasons(),

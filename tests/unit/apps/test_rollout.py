@@ -71,6 +71,10 @@ def lost(observation):
     return hal.Twist([0.0, 0.0, 0.02])
 
 
+def soft(rig, observation):
+    return observation.robots["panda"].controller is hal.ControlMode.OPERATIONAL_SPACE and observation.t > 0.3
+
+
 def dumb(observation):
     return np.zeros(7)
 """
@@ -112,6 +116,14 @@ def test_a_policy_reaches_its_goal_in_every_episode(folder: Path) -> None:
     too_short = rollout(*reach, "--seconds", 0.5, *FAST)
     assert too_short.returncode == 0
     assert report(folder)["episodes"][0]["success"] is False
+
+
+def test_a_policy_drives_with_the_controller_of_the_command_line(folder: Path) -> None:
+    options = ("--policy", "policies:Reach", "--success", "policies:soft", "--seconds", 1.0)
+    controller = ("--controller", "OperationalSpace", "stiffness=[500, 500, 200]", "rotation_stiffness=30")
+    assert rollout(*options, *FAST, *controller).returncode == 0
+    assert report(folder)["episodes"][0]["success"] is True
+    assert report(folder)["controller"].startswith("OperationalSpace stiffness")
 
 
 def test_the_seed_of_an_episode_places_the_objects(folder: Path) -> None:
@@ -292,6 +304,9 @@ def test_an_arm_that_is_lost_between_episodes_keeps_the_results(folder: Path) ->
         (["--policy", "policies:Reach", "--rate", "0"], ["--rate must be positive"]),
         (["--policy", "policies:Reach", "--seed", "-1"], ["--seed must be 0 or more"]),
         (["--policy", "policies:Reach", "--rate", "1"], ["too slow"]),
+        (["--policy", "policies:Reach", "--controller", "Springs"], ["Springs", "JointImpedance"]),
+        (["--policy", "policies:Reach", "--controller", "JointImpedance", "stifness=3"], ["stifness"]),
+        (["--policy", "policies:Reach", "--controller", "JointImpedance", "stiffness=-3"], ["stiffness"]),
         (["--policy", "policies:Reach", "--robot", "pandas"], ["did you mean 'panda'"]),
     ],
 )
