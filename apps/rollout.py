@@ -102,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
         "--controller",
         nargs="+",
         metavar=("NAME", "GAIN=VALUE"),
-        help="what makes the arms follow: Position (default), JointImpedance or OperationalSpace, with their gains, for "
+        help="what makes the arms follow: Position (default), JointImpedance or OperationalSpace, with gains, for "
         "example --controller OperationalSpace stiffness=[500,500,200] rotation_stiffness=30",
     )
     add_episode_options(run)
@@ -170,7 +170,10 @@ def make_controller(words: list[str] | None) -> Controller | None:
     name, *pairs = words
     try:
         gains = {key: yaml.safe_load(value) for key, _, value in (pair.partition("=") for pair in pairs)}
-        return kinds[name](**{key: tuple(gain) if isinstance(gain, list) else gain for key, gain in gains.items()})
+        made: Controller = kinds[name](
+            **{key: tuple(gain) if isinstance(gain, list) else gain for key, gain in gains.items()}
+        )
+        return made
     except KeyError:
         text = f"there is no controller {name!r}, only {', '.join(kinds)}"
     except (TypeError, ValueError, yaml.YAMLError) as error:
@@ -424,7 +427,7 @@ class RolloutRun:
         """Return what an episode's metadata says about its end; without an ``outcome`` the run ended in it."""
         return {
             "interventions": [] if self.takeover is None else self.takeover.intervals,
-            "policy": self.figures(),
+            "policy": self.figures() if outcome is None else dict(outcome.statistics),
             "ended": "stopped" if outcome is None else outcome.ended,
             "code": "" if outcome is None else outcome.code,
         }
