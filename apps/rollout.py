@@ -33,6 +33,7 @@ from hal.apps._common import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    import hal
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.geometry import Pose
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot
-    from hal.servo.controllers import Controller
 
 ENDED_EARLY = 1
 LEROBOT = "lerobot:"
@@ -153,7 +153,7 @@ def _main(args: argparse.Namespace) -> int:
                 recorder.close()
 
 
-def make_controller(words: list[str] | None) -> Controller | None:
+def make_controller(words: list[str] | None) -> hal.Position | hal.JointImpedance | hal.OperationalSpace | None:
     """Return the controller of ``--controller``: the name of its class, then arguments of that as NAME=VALUE.
 
     Raises:
@@ -161,19 +161,17 @@ def make_controller(words: list[str] | None) -> Controller | None:
     """
     import yaml
 
+    import hal
     from hal.errors import CommandError
-    from hal.servo.controllers import JointImpedance, OperationalSpace, Position
 
     if words is None:
         return None
-    kinds: dict[str, Any] = {kind.__name__: kind for kind in (Position, JointImpedance, OperationalSpace)}
+    kinds = {kind.__name__: kind for kind in (hal.Position, hal.JointImpedance, hal.OperationalSpace)}
     name, *pairs = words
     try:
         gains = {key: yaml.safe_load(value) for key, _, value in (pair.partition("=") for pair in pairs)}
-        made: Controller = kinds[name](
-            **{key: tuple(gain) if isinstance(gain, list) else gain for key, gain in gains.items()}
-        )
-        return made
+        gains = {key: tuple(gain) if isinstance(gain, list) else gain for key, gain in gains.items()}
+        return kinds[name](**gains)
     except KeyError:
         text = f"there is no controller {name!r}, only {', '.join(kinds)}"
     except (TypeError, ValueError, yaml.YAMLError) as error:
