@@ -15,8 +15,9 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 import traceback
-from collections import deque
+from collections import Counter, deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,6 +33,7 @@ from hal.apps._common import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    import hal
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.geometry import Pose
@@ -49,6 +51,12 @@ LOAD_TIMEOUT = 300.0
 """Longest time that such a policy may take to load, s."""
 PRINTED_LINES = 20
 """Number of lines of such a server that are part of an error."""
+RECONNECT_TIMEOUT = 60.0
+"""Longest wait between two episodes for a policy's server that was lost, s."""
+RECONNECT_PERIOD = 0.5
+"""Time between two attempts, s."""
+AWAY = ("policy_unreachable", "policy_lost", "policy_timeout")
+"""Codes of a server that is not there, or not yet."""
 NOTE_PERIOD = 0.5
 """Time between two notes to the console on who drives, while that does not change, s."""
 MARKS = {"finish": True, "fail": False}
@@ -60,7 +68,8 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="rollout",
         description="Run a policy under the limits and the dead-man of manual driving; count successes and record.",
-        epilog="Ctrl-C stops the arm. The exit status is 1 if an episode was stopped or the policy raised an error.",
+        epilog="Ctrl-C stops the arm. An episode that the policy ends by an error is a failure, and the next follows; "
+        "a real arm waits for a new press of the dead-man. The exit status is 1 if any episode ended so.",
     )
     add_rig_options(made)
     run = made.add_argument_group("running")
@@ -89,6 +98,13 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="moving a stick takes the arm from the policy, with the dead-man held; letting go gives it back",
     )
+    run.add_argument(
+        "--controller",
+        nargs="+",
+        metavar=("NAME", "GAIN=VALUE"),
+        help="what makes the arms follow: Position (default), JointImpedance or OperationalSpace, with gains, for "
+        "example --controller OperationalSpace stiffness=[500,500,200] rotation_stiffness=30",
+    )
     add_episode_options(run)
     add_deadman_options(run)
     run.add_argument("--out", metavar="DIR", help="dataset to record into")
@@ -113,6 +129,7 @@ def _main(args: argparse.Namespace) -> int:
     if args.policy_config and not remote:
         raise CommandError("--policy-config is for a policy on a server: --policy ws://HOST:PORT")
     config = load_policy_config(args.policy_config) if args.policy_config else None
+    make_controller(args.controller)  # so that a mistake shows before anything is opened
     plan = resolve_plan(args, f"policy   {args.policy}")
     if plan is None:
         return 0
@@ -134,6 +151,32 @@ def _main(args: argparse.Namespace) -> int:
         finally:
             if recorder is not None:
                 recorder.close()
+
+
+def make_controller(words: list[str] | None) -> hal.Position | hal.JointImpedance | hal.OperationalSpace | None:
+    """Return the controller of ``--controller``: the name of its class, then arguments of that as NAME=VALUE.
+
+    Raises:
+        CommandError: There is no such controller, or it does not take these arguments (code ``bad_controller``).
+    """
+    import yaml
+
+    import hal
+    from hal.errors import CommandError
+
+    if words is None:
+        return None
+    kinds = {kind.__name__: kind for kind in (hal.Position, hal.JointImpedance, hal.OperationalSpace)}
+    name, *pairs = words
+    try:
+        gains = {key: yaml.safe_load(value) for key, _, value in (pair.partition("=") for pair in pairs)}
+        gains = {key: tuple(gain) if isinstance(gain, list) else gain for key, gain in gains.items()}
+        return kinds[name](**gains)
+    except KeyError:
+        text = f"there is no controller {name!r}, only {', '.join(kinds)}"
+    except (TypeError, ValueError, yaml.YAMLError) as error:
+        text = f"{name} with {', '.join(pairs)}: {error}"
+    raise CommandError(f"--controller: {text}", code="bad_controller")
 
 
 def is_remote(policy: str) -> bool:
@@ -252,7 +295,9 @@ class RolloutRun:
             self.takeover = Takeover(Teleop(self.robot, mapping), self.pad)
         if recorder is not None:
             recorder.source = self._driver
-        self.figures: Callable[[], dict[str, Any]] = policy.statistics if isinstance(policy, RemotePolicy) else dict
+        self.remote = policy if isinstance(policy, RemotePolicy) else None
+        """The policy, if it is on a server."""
+        self.figures: Callable[[], dict[str, Any]] = dict if self.remote is None else self.remote.statistics
         """Returns the figures of a policy on a server."""
         self._noted, self._next_note = "", 0.0
         self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
@@ -264,6 +309,7 @@ class RolloutRun:
             seconds=args.seconds,
             deadman=deadman,
             unattended=args.unattended or mapping is None,
+            controller=make_controller(args.controller),
             cameras=policy.config.cameras() if isinstance(policy, RemotePolicy) else None,
             history=args.history,
             success=load_object(args.success, "--success") if args.success else None,
@@ -275,15 +321,16 @@ class RolloutRun:
         self.outcomes: list[PolicyOutcome] = []
 
     def run(self) -> int:
-        """Run all episodes, or until one is stopped. Return the exit status."""
+        """Run all episodes, or until a device or a person ends the run. Return the exit status."""
         from hal.errors import HalError, MotionStopped, RobotFault
 
         self.runner.rehearse()
         ended, failed = "", False
         try:
             for number in range(self.args.episodes):
+                self._reconnect()
                 outcome = self._episode(self.args.seed + number)
-                if outcome.ended in ("stopped", "error"):
+                if not self._continues_after(outcome):
                     ended = outcome.reason
                     break
         except (MotionStopped, RobotFault) as stop:  # during a reset
@@ -298,7 +345,43 @@ class RolloutRun:
         self._print_results(ended)
         if self.args.report:
             Path(self.args.report).write_text(json.dumps(self._report(ended), indent=2) + "\n")
-        return ACTION_NEEDED if failed else ENDED_EARLY if ended else 0
+        return ACTION_NEEDED if failed else ENDED_EARLY if ended or self._reasons() else 0
+
+    def _continues_after(self, outcome: PolicyOutcome) -> bool:
+        """Return whether the next episode may begin: after errors of the policy, if a person starts each real arm."""
+        from hal.learning.episode import stands_in_world
+        from hal.learning.policy import POLICY_STOPS
+
+        if outcome.ended not in ("stopped", "error"):
+            return True
+        attended = self.deadman is not None or all(stands_in_world(self.rig, arm) for arm in self.robots.values())
+        return attended and (outcome.ended == "error" or outcome.code in POLICY_STOPS)
+
+    def _reconnect(self) -> None:
+        """Wait until a policy's server that was lost answers again.
+
+        Raises:
+            PolicyError: It does not in time.
+        """
+        from hal.errors import PolicyError
+
+        if self.remote is None or self.remote.client.connected:
+            return None
+        client, end = self.remote.client, time.monotonic() + RECONNECT_TIMEOUT
+        self._announce(f"waiting for {client.url}, at most {RECONNECT_TIMEOUT:g} s")
+        while True:
+            try:
+                return self.runner.rehearse()
+            except PolicyError as error:
+                if error.code not in AWAY:
+                    return None  # it is there; the next episode names what is wrong
+                if time.monotonic() > end:
+                    raise
+            time.sleep(RECONNECT_PERIOD)
+
+    def _reasons(self) -> dict[str, int]:
+        """Return how many episodes ended by each error or stop."""
+        return dict(Counter(outcome.code for outcome in self.outcomes if outcome.code))
 
     def _announce(self, text: str) -> None:
         self.line.event(f"  {text}")
@@ -323,24 +406,40 @@ class RolloutRun:
             outcome = self.runner.run(seed, lambda seconds: self._show(number, seconds))
         finally:
             if self.recorder is not None:
-                if outcome is None:
-                    self.recorder.save(None, wait=True)
-                else:
-                    result = {"interventions": outcome.interventions, "policy": dict(outcome.statistics)}
-                    self.recorder.save(outcome.success, wait=True, result=result)
+                mark = None if outcome is None else outcome.success
+                self.recorder.save(mark, wait=True, result=self._result(outcome))
         self._noted = ""
         self._note_driver("")
+        is_new = outcome.reason not in [earlier.reason for earlier in self.outcomes]
         self.outcomes.append(outcome)
         self._announce(f"episode {number}: {_describe(outcome)}")
         if self.recorder is not None and (trouble := self.recorder.status().trouble):
             self._announce(f"RECORDING: {trouble}")
-        if outcome.error is not None and not isinstance(outcome.error, PolicyError):  # its text is enough
+        if outcome.ended == "error" and is_new and not isinstance(outcome.error, PolicyError):  # its text is enough
+            assert outcome.error is not None
             self.line.clear()
             traceback.print_exception(outcome.error)
         return outcome
 
+    def _result(self, outcome: PolicyOutcome | None) -> dict[str, Any]:
+        """Return what an episode's metadata says about its end; without an ``outcome`` the run ended in it."""
+        return {
+            "interventions": [] if self.takeover is None else self.takeover.intervals,
+            "policy": self.figures() if outcome is None else dict(outcome.statistics),
+            "ended": "stopped" if outcome is None else outcome.ended,
+            "code": "" if outcome is None else outcome.code,
+        }
+
+    def _following(self) -> dict[str, str]:
+        return {"controller": " ".join(self.args.controller)} if self.args.controller else {}
+
     def _info(self) -> dict[str, Any]:
-        return {"policy": self.args.policy, "robot": ",".join(self.robots), "rate_hz": self.args.rate}
+        return {
+            "policy": self.args.policy,
+            "robot": ",".join(self.robots),
+            "rate_hz": self.args.rate,
+            **self._following(),
+        }
 
     def _reset(self, number: int, seed: int) -> None:
         """Reset the scene: real arms drive home, and the seed places objects with random ranges."""
@@ -391,6 +490,8 @@ class RolloutRun:
         marked = [mark for mark in done if mark is not None]
         rate = f", {sum(marked)} of {len(marked)} marked episodes succeeded" if marked else ""
         self._announce(f"{len(done)} episode(s){rate}; the arm is at rest")
+        if reasons := self._reasons():
+            self._announce("ended early: " + ", ".join(f"{count} {code}" for code, count in reasons.items()))
         if ended:
             self._announce(f"ENDED: {ended}")
 
@@ -401,13 +502,16 @@ class RolloutRun:
             "backend": self.robot.spec.driver,
             "clock": self.rig.plan.clock,
             "rate_hz": self.args.rate,
+            **self._following(),
             "recorded": self.args.out,
             "ended": ended,
+            "reasons": self._reasons(),
             "episodes": [
                 {
                     "seed": self.args.seed + number,
                     "success": outcome.success,
                     "ended": outcome.ended,
+                    "code": outcome.code,
                     "reason": outcome.reason,
                     "seconds": outcome.seconds,
                     "turns": outcome.turns,
@@ -437,7 +541,8 @@ def _describe(outcome: PolicyOutcome) -> str:
     p50, p99 = (_ms(outcome.inference[name]) or 0.0 for name in ("p50", "p99"))
     how = {"time": "time limit reached", "stopped": "STOPPED", "error": "the policy raised an error"}
     mark = {True: ", success", False: ", failure", None: ""}[outcome.success if outcome.ended == "time" else None]
-    text = f"{how.get(outcome.ended, outcome.ended)}{mark} after {outcome.seconds:.1f} s, {outcome.turns} step(s)"
+    why = f" ({outcome.code}: {outcome.reason})" if outcome.code else ""
+    text = f"{how.get(outcome.ended, outcome.ended)}{mark}{why} after {outcome.seconds:.1f} s, {outcome.turns} step(s)"
     missed = f", {outcome.missed} MISSED" if outcome.missed else ""
     if taken := outcome.interventions:
         missed += f", {len(taken)} takeover(s) of {sum(end - begin for begin, end in taken):.1f} s"

@@ -1,4 +1,4 @@
-"""A policy on a server: round trip of pictures, cost of asking, tracking of a late policy, and takeovers.
+"""A policy on a server: round trip of pictures, cost of asking, tracking of a late or noisy policy, and takeovers.
 
 python benchmarks/remote_policy.py
 """
@@ -79,6 +79,52 @@ def tracking(latency: float, seconds: float) -> None:
         f"latency {1e3 * latency:3.0f} ms: {np.sqrt((away**2).mean()):.2f} mm rms from a sine of {FREQUENCY} Hz at the "
         f"tcp, greatest acceleration {change:.2f} of the limit, {figures['chunks']} chunks, {figures['late']} late"
     )
+
+
+def seams(latency: float, seconds: float) -> None:
+    """Compare lag and jerk with a naive runner, which plays each chunk from its first action when it arrives."""
+    for sigma, each in ((0.0, False), (0.01, True), (0.01, False)):
+        joined, naive = (_drive_noisy(latency, seconds, sigma, each, how) for how in (False, True))
+        noise = f"noise of {sigma:g} rad in each {'target' if each else 'chunk'}" if sigma else "no noise"
+        ratio = f", rms jerk {joined[1] / naive[1]:.2f} of naive" if sigma else ""
+        lag = f"{joined[0]:.1f} mrad rms from the sine, naive {naive[0]:.1f}"
+        print(f"latency {1e3 * latency:3.0f} ms, {noise}: {lag}{ratio}")
+
+
+def _drive_noisy(latency: float, seconds: float, sigma: float, each: bool, naive: bool) -> tuple[float, float]:
+    """Return the rms distance of a set-point from its sine, mrad, and its rms jerk, rad/s^3."""
+    chance, execute = np.random.default_rng(1), CONFIG["execute"]
+    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
+        wave, begun, chunks, seen = _sine(rig), rig.clock.now(), list[tuple[float, Any]](), list[tuple[float, float]]()
+
+        def infer(request: dict[str, Any]) -> dict[str, Any]:
+            rows = np.array([wave(t) for t in rig.clock.now() + np.arange(STEPS) / RATE])
+            return {"actions": rows + chance.normal(0.0, sigma, (STEPS if each else 1, 7))}
+
+        def play(observation: hal.Observation) -> hal.JointChunk | None:
+            now = rig.clock.now()
+            if not chunks or (now >= chunks[-1][0] + execute / RATE and chunks[-1][1] is None):
+                chunks.append((now, infer({})["actions"]))
+            asked, rows = chunks[-1]
+            if rows is None or now < asked + latency:
+                return None
+            chunks[-1] = (asked, None)
+            return hal.JointChunk(now + np.arange(STEPS) / RATE, rows)
+
+        def turn(_: float) -> None:
+            seen.append((rig.clock.now(), rig.robots["panda"].state().q_set[0]))
+
+        with PolicyServer(infer) as server:
+            remote = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG), latency=latency)
+            policy: Any = play if naive else remote
+            PolicyRunner(rig, policy, rate_hz=100, seconds=seconds, cameras=()).run(on_turn=turn)
+            remote.close()
+        log = np.array([point.q for point in cast(Any, rig.driver("panda")).log])
+        period = (rig.clock.now() - begun) / len(log)
+    jerk = np.diff(log, 3, axis=0)[len(log) // 4 :] / period**3
+    t, q = np.array(seen).T
+    away = (q - np.array([wave(x)[0] for x in t]))[t > t[0] + 3.0]
+    return 1e3 * float(np.sqrt((away**2).mean())), float(np.sqrt((jerk**2).mean()))
 
 
 def cost(seconds: float) -> None:
@@ -183,6 +229,8 @@ def main() -> None:
     round_trip(args.count)
     for latency in (0.05, 0.2, 0.4):
         tracking(latency, 12.0)
+    for latency in (0.1, 0.3):
+        seams(latency, 12.0)
     cost(10.0)
     takeovers(2 * args.count, "lock_step")
     takeovers(50, "real_time")

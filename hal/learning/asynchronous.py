@@ -1,8 +1,9 @@
 """A policy that thinks elsewhere while the arm moves: asked in the background, its chunks joined in time.
 
 :class:`RemotePolicy` is a policy for :class:`~hal.learning.policy.PolicyRunner`. Every chunk has times, counted from
-the observation that it answers: targets that became due while the policy computed are left out, and the others replace
-the old chunk from their first one on. If the answers stop, the arm comes to rest at the end of the last chunk.
+the observation that it answers: targets that became due while the policy computed are left out, and the old chunk is
+blended into the others over some steps. A policy that answers one action is asked once per step. If the answers stop,
+the arm comes to rest at the end of the last chunk.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from ..arguments import number
 from ..commands import CHUNK_AHEAD, CHUNK_POINTS, FIRST_STEP_ANGLE, JointChunk
 from ..errors import ConfigError, NotSupported, PolicyError
 from ..histogram import Histogram
+from .policy import check_targets
 from .policy_config import Decoded, PolicyConfig, load_policy_config
 from .remote import PolicyClient, check_actions
 
@@ -40,6 +42,10 @@ _MARGIN = 1.0
 """Steps of the policy by which it is asked earlier than its latency requires."""
 _ONSET = 1e-3
 """A target must be due so much later than now, s."""
+_HOLD = CHUNK_AHEAD - 0.1
+"""Time in which the arm stays at a single action, or goes there, until the next answer, s."""
+_SINGLE_STEPS = 1.5
+"""Steps in which the arm gets to a single action: the next answer comes before, so that it does not stop there."""
 _REHEARSAL_TIMEOUT = 60.0
 """Longest wait for the answer of a rehearsal, s: some servers compile their policy at its first request."""
 _MOST_CAMERAS = 8
@@ -64,6 +70,8 @@ class _Chunk(NamedTuple):
     """Of each arm (k, n), rad."""
     t_next: float
     """Time from which the next chunk should take over, s."""
+    t_ask: float
+    """Time from which the policy is asked for it, s."""
 
 
 class RemotePolicy:
@@ -145,7 +153,7 @@ class RemotePolicy:
         assert self._pending is not None
         reply, self._pending = self._pending.reply, None
         actions = check_actions(self._result(reply, longest), self._numbers)
-        self.config.decode(actions[:CHUNK_POINTS], observation, self._used)
+        self._decode(actions[:CHUNK_POINTS], observation)
         return None
 
     def reset(self, seed: int | None = None) -> None:
@@ -181,7 +189,7 @@ class RemotePolicy:
         """
         now = self.rig.clock.now()
         chunks = self._receive(now)
-        if self._pending is None and (self._chunk is None or now >= self._chunk.t_next - self._lead()):
+        if self._pending is None and (self._chunk is None or now >= self._chunk.t_ask):
             self._ask(observation, now)
             if not chunks and not self._latency and self.rig.lock_step:
                 chunks = self._receive(now)
@@ -327,14 +335,32 @@ class RemotePolicy:
         self._latencies.append(now - pending.t)
         self._latency_counts.add(now - pending.t)
         self._chunks += 1
-        return self._follow(check_actions(reply, self._numbers), pending.observation, now)
+        return self._follow(check_actions(reply, self._numbers), pending, now)
 
-    def _follow(self, actions: Array, observation: Observation, now: float) -> dict[str, JointChunk]:
-        execute, first = self.config.execute or max(1, len(actions) // 2), self.config.due
+    def _follow(self, actions: Array, pending: _Pending, now: float) -> dict[str, JointChunk]:
+        if len(actions) == 1:
+            chunk = self._single(self._decode(actions, pending.observation), pending, now)
+        else:
+            chunk = self._several(actions, pending.observation, now)
+        self._chunk = chunk
+        return {name: JointChunk(chunk.t, arm.q) for name, arm in chunk.targets.items()}
+
+    def _single(self, decoded: dict[str, Decoded], pending: _Pending, now: float) -> _Chunk:
+        """Return the chunk of one action: the arm goes there, and stays."""
+        t: Array = now + np.array([_SINGLE_STEPS * self._dt, _HOLD])
+        chunk = _Chunk(t, {name: arm.rows([0, 0]) for name, arm in decoded.items()}, float(t[0]), pending.t + self._dt)
+        if self._chunk is None:
+            return chunk
+        self._check_splice(self._chunk, chunk, now)
+        planned = self._chunk.t_ask + self._dt  # turns are rounded up to those of the runner, without adding up
+        return chunk._replace(t_ask=planned) if planned > pending.t else chunk
+
+    def _several(self, actions: Array, observation: Observation, now: float) -> _Chunk:
+        execute, first, old = self.config.execute or max(1, len(actions) // 2), self.config.due, self._chunk
         # An arm that has stood still since the observation starts at the beginning, not where it would have been.
-        start = now if self._chunk is None else observation.t
+        start = now if old is None else observation.t
         actions = actions[: int((now - start + CHUNK_AHEAD) / self._dt) + 1]
-        decoded, steps = self.config.decode(actions, observation, self._used), len(actions)
+        decoded, steps = self._decode(actions, observation), len(actions)
         t: Array = start + self._dt * np.arange(first, first + steps, dtype=float)
         ahead = (t > now + _ONSET) & (t < now + CHUNK_AHEAD - self._dt)
         ahead[min(len(t), 2 * execute + int(np.argmax(ahead))) :] = False  # not for long after the server's death
@@ -344,14 +370,46 @@ class RemotePolicy:
                 code="policy_too_late",
             )
         used = np.flatnonzero(ahead)[:CHUNK_POINTS]
-        targets = {
-            name: Decoded(arm.q[used], None if arm.grip is None else arm.grip[used]) for name, arm in decoded.items()
-        }
-        chunk = _Chunk(t[used], targets, start + execute * self._dt)
-        if self._chunk is not None:
-            self._check_splice(self._chunk, chunk, now)
-        self._chunk = chunk
-        return {name: JointChunk(chunk.t, arm.q) for name, arm in targets.items()}
+        targets = {name: arm.rows(used) for name, arm in decoded.items()}
+        t_next = start + execute * self._dt
+        chunk = _Chunk(t[used], targets, t_next, t_next - self._lead())
+        if old is None:
+            return chunk
+        self._check_splice(old, chunk, now)
+        return self._blended(old, t, decoded, chunk, now)
+
+    def _blended(self, old: _Chunk, t: Array, decoded: dict[str, Decoded], new: _Chunk, now: float) -> _Chunk:
+        """Return ``new`` at the times of the old chunk, which changes into it over the steps of ``blend``.
+
+        Both have a target every step, but not at the same times: one that is due shortly after another of the other
+        chunk would turn the noise of a policy into jerk.
+
+        Args:
+            old: The present chunk.
+            t: Times of all targets of the answer (k,), s.
+            decoded: These targets.
+            new: Those of them that are ahead.
+            now: Time, s.
+        """
+        begin, end = (int(np.ceil((x - old.t[0]) / self._dt)) for x in (now + _ONSET, new.t[-1]))
+        grid: Array = (old.t[0] + self._dt * np.arange(begin, max(begin, end) + 1))[:CHUNK_POINTS]
+        over = min(self.config.blend * self._dt, old.t[-1] - now)
+        share = np.clip((grid - now) / max(over, _ONSET), 0.0, 1.0) * (grid >= t[0] - _ONSET)
+        share[grid > old.t[-1]] = 1.0
+        targets = {}
+        for name, arm in decoded.items():
+            fresh = _sampled(t, arm, grid)
+            q = fresh.q + (1.0 - share)[:, None] * (_sampled(old.t, old.targets[name], grid).q - fresh.q)
+            k = np.maximum(np.searchsorted(t, grid + _ONSET) - 1, 0)
+            targets[name] = Decoded(q, None if arm.grip is None else arm.grip[k])
+        return new._replace(t=grid, targets=targets)
+
+    def _decode(self, actions: Array, observation: Observation) -> dict[str, Decoded]:
+        """Return the targets of each arm, all of them checked."""
+        decoded = self.config.decode(actions, observation, self._used)
+        for name, arm in decoded.items():
+            check_targets(self._used[name], self._dt * np.arange(len(actions), dtype=float), arm.q)
+        return decoded
 
     def _check_splice(self, old: _Chunk, new: _Chunk, now: float) -> None:
         """Refuse a chunk that begins farther away than an arm can be when its first target is due."""

@@ -199,7 +199,7 @@ class EpisodeWorker:
             rig, policy, robot=robot, rate_hz=r.rate_hz, seconds=r.seconds, history=r.history, success=judge
         )
         outcome = runner.run(seed)
-        reason = outcome.reason if outcome.error is None else _trace(outcome.error)
+        reason = _trace(outcome.error) if outcome.ended == "error" and outcome.error else outcome.reason
         success = False if outcome.ended == "stopped" else outcome.success
         return success, outcome.ended, reason
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..commands import Command, CommandChecks, JointVelocity
-from ..errors import CommandError, ConnectionLost, MotionStopped, PolicyError, RobotFault, StaleStateError
+from ..commands import FIRST_STEP_ANGLE, Command, CommandChecks, JointChunk, JointVelocity
+from ..errors import CommandError, ConnectionLost, HalError, MotionStopped, PolicyError, RobotFault, StaleStateError
 from ..histogram import Histogram
 from ..observation import Observation
 from ..types import Trip
@@ -33,6 +34,7 @@ __all__ = [
     "PolicyOutcome",
     "Policy",
     "PolicyRunner",
+    "check_targets",
     "is_made_with_rig",
     "load_object",
     "load_policy",
@@ -45,6 +47,10 @@ PolicyAnswer: TypeAlias = "ArmAnswer | Mapping[str, ArmAnswer]"
 """What one arm does; or, for several, the name of each arm -> what it does."""
 
 
+PAST_LIMIT = 0.05
+"""Greatest distance of a target past a joint's limit, rad; so little is noise, and cut off."""
+POLICY_STOPS = frozenset(trip.code for trip in (Trip.COMMAND_LATE, Trip.LIMIT, Trip.APP_SILENT, Trip.HOST_LATE))
+"""Codes of the stops that a policy causes, or a computer that is too slow for it; such an episode is a failure."""
 FIRST_ANSWER = 2.5
 """Time for a policy's first command of an episode or after a pause, s; the arm stands still until then."""
 
@@ -111,12 +117,45 @@ def load_policy(place: str, rig: Rig) -> Policy:
     return cast(Policy, target)
 
 
+def check_targets(robot: Robot, t: NDArray[np.float64], q: NDArray[np.float64]) -> None:
+    """Check all targets of a chunk, so that a wrong one is refused before the first is followed.
+
+    Args:
+        robot: The arm.
+        t: Their times (k,), s.
+        q: Joint positions (k, n), rad, finite.
+
+    Raises:
+        PolicyError: One is past a joint's limit (code ``policy_bad_actions``), or farther from an earlier one than the
+            arm travels in the time between them, and 0.1 rad (``policy_jump``).
+    """
+    past = np.maximum(np.array(robot.limits.lower) - q, q - np.array(robot.limits.upper))
+    k, joint = np.unravel_index(np.argmax(past), past.shape)
+    if past[k, joint] > PAST_LIMIT:
+        raise PolicyError(
+            f"target {k + 1} of {len(q)} in the policy's chunk is {q[k, joint]:.4g} rad at {robot.joints[joint]} of "
+            f"{robot.name}, {past[k, joint]:.3g} rad past its limit",
+            code="policy_bad_actions",
+        )
+    reach = np.asarray(robot.limits.velocity) * (t - t[0])[:, None]
+    jump = np.maximum(*(way - reach - np.minimum.accumulate(way - reach) for way in (q, -q)))
+    k, joint = np.unravel_index(np.argmax(jump), jump.shape)
+    if jump[k, joint] > FIRST_STEP_ANGLE:
+        raise PolicyError(
+            f"target {k + 1} of {len(q)} in the policy's chunk is {jump[k, joint]:.3g} rad farther from an earlier one "
+            f"at {robot.joints[joint]} of {robot.name} than the arm travels in the time between them; it may be "
+            f"{FIRST_STEP_ANGLE} rad",
+            code="policy_jump",
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class PolicyOutcome:
     """Result of one episode."""
 
     success: bool | None
-    """Whether it succeeded; None if that is not known. False if time ran out before ``success`` was true."""
+    """Whether it succeeded; None if that is not known. False after an error or a stop of the policy's, or if time ran
+    out before ``success`` was true."""
     ended: str
     """``success``, ``failure`` (marked by the operator), ``time``, ``stopped`` or ``error``."""
     reason: str
@@ -133,11 +172,17 @@ class PolicyOutcome:
     inference: dict[str, float | None]
     """p50, p99 and max of the policy's time per call, s."""
     error: BaseException | None = None
-    """Error of the policy."""
+    """Error of the policy, or the stop."""
     statistics: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the policy's own, if it has any (see :meth:`.RemotePolicy.statistics`)."""
     interventions: tuple[tuple[float, float], ...] = ()
     """Begin and end of each time in which a person drove, s on ``rig.clock``."""
+
+    @property
+    def code(self) -> str:
+        """Name of the error or the stop: its ``code``, such as ``policy_lost``, or its type; else empty."""
+        error = self.error
+        return "" if error is None else error.code if isinstance(error, HalError) else type(error).__name__
 
 
 class PolicyRunner:
@@ -244,7 +289,7 @@ class PolicyRunner:
                     raise
         except (MotionStopped, RobotFault, ConnectionLost, StaleStateError) as stop:
             arms = f"{', '.join(stopped)}: " if stopped and len(controls) > 1 else ""
-            tally.end_as("stopped", arms + getattr(stop, "reason", str(stop)))
+            tally.end_as("stopped", arms + getattr(stop, "reason", str(stop)), stop)
         except _PolicyError as wrong:
             error = wrong.__cause__
             tally.end_as("error", f"{type(error).__name__}: {error}", error)
@@ -298,7 +343,7 @@ class PolicyRunner:
             for name in controls.keys() - begun:
                 controls[name].hold_for(FIRST_ANSWER)
             answers = self._answer(observation, tally)
-            with _policy_errors(CommandError):
+            with _policy_errors((CommandError, PolicyError)):
                 for name, (command, grip) in answers.items():
                     self._send(controls[name], command, grip, first=name not in begun)
             begun |= {name for name, (command, _) in answers.items() if command is not None}
@@ -310,6 +355,8 @@ class PolicyRunner:
         if command is not None and first:  # a first target that is far away is refused, as in any session
             checks, now = CommandChecks(control.robot), self.rig.clock.now()
             checks.check_first(checks.checked(command, now, []), now, control.robot.state().q_set.tolist())
+        if isinstance(command, JointChunk) and command.q.shape[1] == control.robot.n:
+            check_targets(control.robot, command.t, command.q)
         control.send(command, grip=grip)
 
     def _answer(self, observation: Observation, tally: _Tally) -> dict[str, tuple[Command | None, float | None]]:
@@ -360,8 +407,8 @@ class _PolicyError(Exception):
 
 
 @contextlib.contextmanager
-def _policy_errors(kind: type[Exception]) -> Iterator[None]:
-    """Raise errors of this kind as a :class:`_PolicyError`."""
+def _policy_errors(kind: type[Exception] | tuple[type[Exception], ...]) -> Iterator[None]:
+    """Raise errors of this kind, or of these, as a :class:`_PolicyError`."""
     try:
         yield
     except kind as error:
@@ -396,6 +443,8 @@ class _Tally:
 
     def outcome(self) -> PolicyOutcome:
         marks = {"success": True, "failure": False, "error": False, "time": False if self._judged else None}
+        if getattr(self._error, "code", "") in POLICY_STOPS:
+            marks["stopped"] = False
         return PolicyOutcome(
             success=marks.get(self._ended),
             ended=self._ended,

@@ -43,6 +43,8 @@ STATES = ("q", "dq", "tcp_position", "tcp_quaternion", "tcp_rpy", "tcp_rotvec", 
 _OF_GRIPPER = STATES[-3:]
 _SUMMED = ("joint_velocity", "tcp_delta")
 """Kinds of actions that are steps from one target to the next."""
+_LARGEST_STEP = np.pi
+"""Greatest number of such a step, rad or m: a policy that asks for more is broken."""
 _FOLLOWED = 0.9
 """Share of the rig's speeds that a step may use; the rest lets an arm that starts late catch up."""
 
@@ -137,6 +139,10 @@ class Decoded(NamedTuple):
     grip: Array | None
     """Grips (k,), 0 open to 1 closed; None if the policy does not move the gripper."""
 
+    def rows(self, which: Any) -> Decoded:
+        """Return the targets of these indices."""
+        return Decoded(self.q[which], None if self.grip is None else self.grip[which])
+
 
 class ActionConfig(Strict):
     """The meaning of a row of actions, or of the part of it that moves one of several arms."""
@@ -174,13 +180,23 @@ class ActionConfig(Strict):
         """Return the targets of the rows (k, numbers) of one arm, which answer ``observation``, ``period`` s apart.
 
         Raises:
-            PolicyError: A pose of the tcp is out of reach (code ``policy_unreachable_pose``).
+            PolicyError: A pose of the tcp is out of reach (code ``policy_unreachable_pose``); or a step is more than pi
+                rad or m (``policy_bad_actions``).
         """
         state, grip = observation.robots[robot.name], None
         if self.gripper is not None:
             assert robot.gripper is not None
             grip = self.gripper.grip(actions[:, self.gripper.index], robot.gripper.width_max)
             actions = np.delete(actions, self.gripper.index, axis=1)
+        if self.kind in _SUMMED:
+            scales = [*[self.scale] * 3, *[self.turn] * 3] if self.kind == "tcp_delta" else self.scale
+            steps = np.abs(actions * scales).max(axis=1)
+            if steps.max() > _LARGEST_STEP:
+                raise PolicyError(
+                    f"action {int(steps.argmax()) + 1} of {len(steps)} in the policy's chunk is a step of "
+                    f"{steps.max():.3g} rad or m; it may be {_LARGEST_STEP:.3g}",
+                    code="policy_bad_actions",
+                )
         if self.clip:
             actions = actions / np.maximum(1.0, np.abs(actions).max(axis=1, keepdims=True))
         if self.kind == "tcp_delta":
@@ -259,6 +275,8 @@ class PolicyConfig(Strict):
     """Rate of the policy's actions, Hz."""
     execute: Annotated[int, Field(ge=1, le=256)] | None = None
     """Actions of a chunk that are driven before those of the next one; None: half of the chunk."""
+    blend: Annotated[int, Field(ge=0, le=256)] = 6
+    """Steps over which the arm changes from one chunk to the next."""
     observation: dict[str, Source]
     """Key of the request -> where its value comes from."""
     action: ActionConfig | None = None

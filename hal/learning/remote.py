@@ -409,6 +409,8 @@ def check_actions(reply: Any, numbers: int) -> np.ndarray[Any, np.dtype[np.float
         actions = np.asarray(found, np.float64)
     except (TypeError, ValueError) as error:
         raise PolicyError(f"the policy's actions are no numbers: {error}", code="policy_bad_actions") from error
+    if actions.ndim == 1:  # one action
+        actions = actions[None]
     if actions.ndim == 3 and len(actions) == 1:  # a batch of one
         actions = actions[0]
     if actions.ndim != 2 or not len(actions) or actions.shape[1] != numbers:

@@ -20,7 +20,7 @@ def late(observation):
 """
 
 
-def test_a_late_policy_stops_the_arm_and_ends_the_run(tmp_path: Path) -> None:
+def test_a_late_policy_stops_the_arm_in_each_episode(tmp_path: Path) -> None:
     (tmp_path / "policies.py").write_text(POLICY)
     command = [sys.executable, str(APP), "--policy", "policies:late", "--episodes", "3", "--report", "report.json"]
     command += ["--sim", "--set", "cameras={}"]
@@ -28,5 +28,6 @@ def test_a_late_policy_stops_the_arm_and_ends_the_run(tmp_path: Path) -> None:
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     assert "the arm is at rest" in done.stdout
-    (episode,) = json.loads((tmp_path / "report.json").read_text())["episodes"]
-    assert episode["ended"] == "stopped"
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [episode["ended"] for episode in report["episodes"]] == ["stopped"] * 3
+    assert report["reasons"] == {"command_deadline": 3}

@@ -71,6 +71,10 @@ def lost(observation):
     return hal.Twist([0.0, 0.0, 0.02])
 
 
+def soft(rig, observation):
+    return observation.robots["panda"].controller is hal.ControlMode.OPERATIONAL_SPACE and observation.t > 0.3
+
+
 def dumb(observation):
     return np.zeros(7)
 """
@@ -112,6 +116,14 @@ def test_a_policy_reaches_its_goal_in_every_episode(folder: Path) -> None:
     too_short = rollout(*reach, "--seconds", 0.5, *FAST)
     assert too_short.returncode == 0
     assert report(folder)["episodes"][0]["success"] is False
+
+
+def test_a_policy_drives_with_the_controller_of_the_command_line(folder: Path) -> None:
+    options = ("--policy", "policies:Reach", "--success", "policies:soft", "--seconds", 1.0)
+    controller = ("--controller", "OperationalSpace", "stiffness=[500, 500, 200]", "rotation_stiffness=30")
+    assert rollout(*options, *FAST, *controller).returncode == 0
+    assert report(folder)["episodes"][0]["success"] is True
+    assert report(folder)["controller"].startswith("OperationalSpace stiffness")
 
 
 def test_the_seed_of_an_episode_places_the_objects(folder: Path) -> None:
@@ -222,9 +234,10 @@ def test_pages_show_who_drives_and_the_figures_of_a_policy_while_it_drives(folde
 
 def test_a_recorded_pad_that_has_ended_ends_the_run(folder: Path) -> None:
     pad = write_pad(folder, until=0.3)
-    done = rollout("--policy", "policies:Reach", "--deadman", "--pad", pad, *FAST)
+    done = rollout("--policy", "policies:Reach", "--deadman", "--pad", pad, "--out", "runs", *FAST)
     assert done.returncode == 2
     assert "the recorded pad has ended" in done.stderr
+    assert Dataset(folder / "runs").episodes[0].info["result"]["ended"] == "stopped"
 
 
 def test_takeover_needs_a_dead_man(folder: Path) -> None:
@@ -238,14 +251,16 @@ def test_a_terminal_that_makes_steps_cannot_hold_the_dead_man() -> None:
     assert caught.value.code == "cannot_hold"
 
 
-def test_an_error_of_the_policy_ends_the_run(folder: Path) -> None:
-    done = rollout("--policy", "policies:lost", "--episodes", 3, *FAST)
+def test_an_error_of_the_policy_is_a_failed_episode_and_the_run_continues(folder: Path) -> None:
+    done = rollout("--policy", "policies:lost", "--episodes", 3, "--out", "runs", *FAST)
     assert done.returncode == 1, done.stderr
-    assert [episode["ended"] for episode in report(folder)["episodes"]] == ["error"]
-    assert "ENDED" in done.stdout
-    assert "the arm is at rest" in done.stdout
+    found = report(folder)
+    assert [(episode["ended"], episode["success"]) for episode in found["episodes"]] == [("error", False)] * 3
+    assert (found["ended"], found["reasons"]) == ("", {"ValueError": 3})
+    assert [episode.info["result"]["code"] for episode in Dataset(folder / "runs").episodes] == ["ValueError"] * 3
+    assert "3 ValueError" in done.stdout
     for text in ("ValueError: no idea", "policies.py"):
-        assert text in done.stderr
+        assert done.stderr.count(text) == 1
 
 
 def test_an_error_of_a_policys_server_is_one_line(folder: Path) -> None:
@@ -265,7 +280,7 @@ def test_an_error_of_a_policys_server_is_one_line(folder: Path) -> None:
         url = server.url.replace("ws", "http")
         done = rollout("--policy", url, "--policy-config", "joints.yaml", "--seconds", 2.0, *FAST)
     assert done.returncode == 1, done.stderr
-    assert "ValueError: out of memory" in report(folder)["ended"]
+    assert "ValueError: out of memory" in report(folder)["episodes"][0]["reason"]
     assert done.stderr.count("Traceback") == 1, "that of the server, which runs in this process"
 
 
@@ -289,6 +304,9 @@ def test_an_arm_that_is_lost_between_episodes_keeps_the_results(folder: Path) ->
         (["--policy", "policies:Reach", "--rate", "0"], ["--rate must be positive"]),
         (["--policy", "policies:Reach", "--seed", "-1"], ["--seed must be 0 or more"]),
         (["--policy", "policies:Reach", "--rate", "1"], ["too slow"]),
+        (["--policy", "policies:Reach", "--controller", "Springs"], ["Springs", "JointImpedance"]),
+        (["--policy", "policies:Reach", "--controller", "JointImpedance", "stifness=3"], ["stifness"]),
+        (["--policy", "policies:Reach", "--controller", "JointImpedance", "stiffness=-3"], ["stiffness"]),
         (["--policy", "policies:Reach", "--robot", "pandas"], ["did you mean 'panda'"]),
     ],
 )

@@ -212,7 +212,7 @@ def test_a_late_policy_trips_like_any_program(rig: Rig) -> None:
 
     rig.clock.sleep(0.2)
     outcome = PolicyRunner(rig, policy, rate_hz=20).run()
-    assert (outcome.ended, outcome.success) == ("stopped", None)
+    assert (outcome.ended, outcome.success, outcome.code) == ("stopped", False, "command_deadline")
     assert "commands stopped coming" in outcome.reason
     assert is_at_rest(rig)
 

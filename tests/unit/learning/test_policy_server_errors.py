@@ -88,6 +88,39 @@ def test_a_bad_answer_later_ends_the_episode_at_rest(rig: Rig, infer: Any, code:
     assert_within_limits(rig)
 
 
+KINDS = ("joint_position", "joint_delta", "joint_velocity")
+MISTAKES = ("nan", "huge", "past a limit", "jump", "too fast")
+
+
+@pytest.mark.parametrize("number", range(40))
+def test_a_mistake_in_any_later_target_is_refused_when_it_arrives(rig: Rig, number: int) -> None:
+    arm, chance, calls = rig.robots["panda"], np.random.default_rng(number), list[float]()
+    kind = KINDS[number % 3]
+    mistake = chance.choice(MISTAKES[:2] if kind == "joint_velocity" else MISTAKES)
+    row, joint, sign = int(chance.integers(1, STEPS)), int(chance.integers(7)), float(chance.choice([-1.0, 1.0]))
+    size = {"nan": np.nan, "huge": 10.0 ** chance.uniform(1.5, 300.0), "past a limit": chance.uniform(0.06, 9.0)}
+    size |= {"jump": 0.11 + arm.limits.velocity[joint] * row / 15, "too fast": 4.0 / 15}
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        calls.append(rig.clock.now())
+        q = request["state"][:7].astype(float)
+        actions = np.tile(q if kind == "joint_position" else np.zeros(7), (STEPS, 1))
+        if len(calls) == 3:
+            limit = (arm.limits.upper if sign > 0.0 else arm.limits.lower)[joint]
+            begin = limit - q[joint] if mistake == "past a limit" else 0.0
+            rows = np.arange(STEPS) if mistake == "too fast" else np.arange(STEPS) == row
+            actions[:, joint] += rows * begin + np.where(rows > 0, sign * size[mistake] * rows, 0.0)
+        return {"actions": actions}
+
+    outcome = run(rig, infer, config={**CONFIG, "action": {"kind": kind}}, seconds=2.0)
+    assert isinstance(outcome.error, hal.PolicyError), (mistake, row, joint)
+    assert outcome.error.code in ("policy_bad_actions", "policy_jump")
+    assert len(calls) == 3
+    assert rig.clock.now() - calls[-1] < 0.1, "when it arrives, not when it is due"
+    assert np.abs(arm.state().dq_set).max() < 1e-9
+    assert_within_limits(rig)
+
+
 def test_a_policy_that_is_faster_than_the_rig_allows_is_followed_at_the_rigs_speed(rig: Rig) -> None:
     """It used to leave the arm behind, until the next chunk, which begins where the arm is, seemed to jump."""
     action = {"kind": "joint_velocity", "scale": 0.2, "gripper": {"index": 7}}

@@ -98,6 +98,45 @@ def test_chunks_of_a_late_policy_join_without_a_step(rig: Rig, latency: float) -
     assert abs(figures["latency"]["p50"] - latency) < 0.03
 
 
+@pytest.mark.parametrize("latency", [0.1, 0.3])
+def test_the_noise_of_a_policy_makes_no_more_jerk_where_chunks_meet(latency: float) -> None:
+    """Each chunk is off by another way; with ``blend: 0`` the arm changes at once."""
+
+    def jerk(blend: int) -> float:
+        chance = np.random.default_rng(1)
+        with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
+            wave = sine(rig)
+
+            def infer(request: dict[str, Any]) -> dict[str, Any]:
+                t, away = rig.clock.now() + np.arange(STEPS) / 15, chance.normal(0.0, 0.01, 7)
+                return {"actions": np.array([[*(wave(x) + away), 0.0] for x in t])}
+
+            assert run(rig, infer, config={**CONFIG, "blend": blend}, latency=latency, seconds=6.0).ended == "time"
+            points = np.array([point.q for point in rig.driver("panda").log])
+        return float(np.sqrt((np.diff(points, 3, axis=0) ** 2).mean()))
+
+    assert jerk(6) < 0.6 * jerk(0)
+
+
+@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("latency", [0.0, 0.03, 0.3])
+def test_a_policy_that_answers_one_action_is_asked_once_per_step(rig: Rig, flat: bool, latency: float) -> None:
+    asked: list[float] = []
+    wave = sine(rig)
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        asked.append(rig.clock.now())
+        row = np.array([*wave(asked[-1]), 0.0])
+        return {"actions": row if flat else row[None]}
+
+    outcome = run(rig, infer, latency=latency, seconds=4.0)
+    assert (outcome.ended, outcome.reason) == ("time", "")
+    assert np.diff(asked).mean() == pytest.approx(max(1 / 15, latency), abs=0.01)
+    away = np.abs(rig.robots["panda"].state().q_set - wave(rig.clock.now()))
+    assert away.max() < 0.19 * (2.0 * latency + 2 / 15), "at 0.19 rad/s: an answer, and the step that it is for"
+    assert_within_limits(rig)
+
+
 def test_the_gripper_closes_by_the_policys_own_convention(rig: Rig) -> None:
     gripper = rig.robots["panda"].gripper
     assert gripper is not None
