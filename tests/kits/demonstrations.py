@@ -54,7 +54,9 @@ def rows(arm: hal.Robot, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     )
     later = asked[np.minimum(np.arange(len(asked)) + AHEAD, len(asked) - 1)]
     later[:, :5] -= seen[:, :5]
-    return seen, later
+    later[:, 5] = asked[:, 5]  # the fingers close where they did, and not on the way there
+    acts = (np.abs(later[:, :3]).max(axis=1) > 0.003) | (np.abs(later[:, 5] - seen[:, 5]) > 0.005)
+    return seen[acts], later[acts]  # where nothing happens, there is nothing to learn, and a policy would wait for ever
 
 
 def pose_of(row: np.ndarray) -> Pose:
