@@ -1,7 +1,7 @@
 """From a demonstration to a policy and back: what is generated or recorded lifts the cube again.
 
-Each loop goes through the command line, in lock-step, with few episodes; ``HAL_SOAK=1`` runs the counts of the page on
-measurements.
+Demonstrations and policies go through the command line, in lock-step, with few episodes on one engine each;
+``HAL_SOAK=1`` runs 20 of each on both.
 """
 
 from __future__ import annotations
