@@ -108,12 +108,15 @@ def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
     """Yield lines for the banner: the arm, other arms that moved in the recording, and damaged images."""
     from hal.errors import DatasetError
     from hal.learning.replay import other_moving_arms
+    from hal.recording.layout import GRIP_FORCE
 
     yield f"replays  {robot.name}"
     try:
         episode.check_pictures()
     except DatasetError as error:
         yield f"damaged  {error}; images are not needed here"
+    if robot.gripper is not None and GRIP_FORCE not in episode.columns:
+        yield "fingers  this recording lacks the gripper's force: grasps of scripts and skills touch, and do not press"
     for name in other_moving_arms(episode, robot.name):
         yield f"still    {name} moved in the recording; it is not replayed"
 

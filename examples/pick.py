@@ -36,7 +36,7 @@ def pick(rig: hal.Rig, random: np.random.Generator) -> bool:
     """Pick the cube up, and return whether it was lifted: a skill for hal-generate, which resets the scene before."""
     arm = next(iter(rig.robots.values()))
     start = rig.world.pose("cube")
-    approach = random.uniform(0.3, 0.5)  # of the arm's speed, so that the demonstrations differ
+    approach = random.uniform(0.2, 0.3)  # of the arm's speed, so that the demonstrations differ
     grasp = grasp_pose(arm, start)
 
     arm.gripper.open()

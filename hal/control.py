@@ -105,6 +105,10 @@ class Control:
             self.speed = _share("speed", speed, spec.speed, spec.speed)
         else:
             self.speed = _share("speed", speed, spec.move_speed, 1.0)
+            if robot.recorded and self.speed > spec.speed:
+                text = f"{robot.name} is recorded: its speed is {spec.speed:g} and not {self.speed:g}, so that a replay"
+                warnings.warn(f"{text}, which may be no faster, can follow", RuntimeWarning, stacklevel=5)
+                self.speed = spec.speed
         self.tcp_speed = _share("tcp_speed", tcp_speed, spec.tcp_speed, spec.tcp_speed)
         self._goal, self._path = goal, path
         self._mail = robot._mail
@@ -122,8 +126,8 @@ class Control:
         self._unreported: Trip | None = None
         """The stop that no call has reported when the session began to end; None before."""
         self._detach: Callable[[], None] | None = None
-        self._grip = (0.0, 0)
-        """Width of the newest command to the gripper, m, and its number; 0 before the first one."""
+        self._grip = (0.0, 0.0, 0)
+        """Width, m, force, N, and number of the newest command to the gripper; 0 before the first one."""
         self._refused = 0
         self._t_sent = -math.inf
         self._at_once = 0
@@ -311,6 +315,7 @@ class Control:
         *,
         grip: float | None = None,
         width: float | None = None,
+        force: float | None = None,
         gripper: float | None = None,
         t_event: float | None = None,
     ) -> Sent:
@@ -320,6 +325,7 @@ class Control:
             command: Target, chunk, velocity, twist, pose or torque, see :mod:`hal.commands`; None leaves the arm alone.
             grip: Grip from 0 (open) to 1 (closed); None leaves the gripper alone.
             width: Distance between the fingers, m, instead of ``grip``.
+            force: Greatest force on an object in between, N; the gripper's default if left out.
             gripper: Former name of ``grip``, deprecated.
             t_event: Time of the pad event behind the command, s, for latency figures; None or -inf without one.
 
@@ -327,8 +333,8 @@ class Control:
             What was sent, and the reasons for every difference from ``command``.
 
         Raises:
-            CommandError: A wrong shape, a value that is not finite, a grip or width out of range, or a first target too
-                far away; nothing is sent.
+            CommandError: A wrong shape, a value that is not finite, a grip, width or force out of range, or a first
+                target too far away; nothing is sent.
             Unreachable: A pose beyond the arm's reach; nothing is sent.
             NotSupported: Torques or a grip, for an arm without; nothing is sent.
             MotionStopped: After a trip, until it is acknowledged (see :meth:`rearm`); ``code`` is that of the trip.
@@ -357,7 +363,7 @@ class Control:
                 "the servo refused an earlier command: a first target too far away, too late, or torques and another "
                 "kind of command without a rest in between"
             )
-        target = self._finger_width(grip, width, gripper)
+        target = self._finger_target(grip, width, gripper, force)
         if command is not None:
             if self._goal is not None or self._path is not None:
                 raise CommandError("this session makes one motion; it takes no commands", code="move_to_session")
@@ -377,7 +383,7 @@ class Control:
                 self._mail.put_command(record)
         if target is not None:
             with self._lock:
-                self._send_width(target, waiting, reasons)
+                self._send_fingers(target, waiting, reasons)
         return Sent(command, tuple(reasons))
 
     def hold_until_following(self) -> bool:
@@ -477,8 +483,10 @@ class Control:
             self._publish(self._record._replace(acknowledged=seen, rearms=self._record.rearms + 1))
         self.robot._latch.acknowledge(seen)
 
-    def _finger_width(self, grip: float | None, width: float | None, former: float | None) -> float | None:
-        """Return the width in m that ``send`` requests of the gripper, or None; checked before anything is sent."""
+    def _finger_target(
+        self, grip: float | None, width: float | None, former: float | None, force: float | None
+    ) -> tuple[float, float] | None:
+        """Return the width, m, and force, N, that ``send`` asks of the gripper, or None; checked before it is sent."""
         given = {"grip": grip, "width": width, "gripper": former}
         passed = {name: value for name, value in given.items() if value is not None}
         if not passed:
@@ -489,11 +497,10 @@ class Control:
         if gripper is None:
             raise NotSupported(f"{self.robot.name} has no gripper", code="no_gripper")
         ((name, value),) = passed.items()
-        if name == "width":
-            return number(name, value, "m", least=0.0, most=gripper.width_max)
-        return gripper.width_of(number(name, value))
+        width, _, force = gripper._checked(value if name == "width" else gripper.width_of(value), None, force)
+        return width, force
 
-    def _send_width(self, width: float, waiting: bool, reasons: list[str]) -> None:
+    def _send_fingers(self, target: tuple[float, float], waiting: bool, reasons: list[str]) -> None:
         gripper = self.robot.gripper
         assert gripper is not None
         if gripper.trouble:
@@ -501,9 +508,10 @@ class Control:
         if waiting:
             reasons.append("the dead-man is not held: the gripper does not move")
             return
-        before, number = self._grip
-        if not number or abs(width - before) > gripper.spec.width_max * 0.005 or gripper._was_stopped(number):
-            self._grip = (width, gripper._send(self._id, width))
+        before, pressed, number = self._grip
+        small = abs(target[0] - before) <= gripper.spec.width_max * 0.005 and target[1] == pressed
+        if not (number and small) or gripper._was_stopped(number):
+            self._grip = (*target, gripper._send(self._id, *target))
 
 
 def _share(name: str, value: float | None, default: float, most: float) -> float:

@@ -294,7 +294,7 @@ class GripperReading(NamedTuple):
     width: float
     """Distance between the fingers, m."""
     width_target: float
-    """Width of the newest command, m."""
+    """Width that the newest command asked of the fingers, m: 0 after a grasp, whose fingers press beyond the object."""
     moving: bool
     grasped: bool | None = None
     """Whether the fingers hold an object; None if unknown."""
@@ -341,7 +341,7 @@ class GripperDriver(DeviceDriver):
     def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
         """Start to close on an object and hold it.
 
-        By default it is a :meth:`move` to ``width - inner``, which presses on what is in between.
+        By default it is a :meth:`move` until the fingers are closed, which presses on what is in between.
 
         Args:
             width: Expected width of the object, m.
@@ -350,7 +350,7 @@ class GripperDriver(DeviceDriver):
             inner: The object counts as held if it is at most so much narrower than ``width``, m,
             outer: and at most so much wider, m.
         """
-        self.move(max(0.0, width - inner), speed, force)
+        self.move(0.0, speed, force)
 
     def home(self) -> None:
         """Start to measure how far the fingers open. Some grippers need it once after they are switched on."""

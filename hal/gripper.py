@@ -63,6 +63,11 @@ class Gripper:
         return self.spec.width_max
 
     @property
+    def force_max(self) -> float:
+        """Greatest force that may be asked of the fingers, N."""
+        return self.spec.force_max or self.spec.force
+
+    @property
     def period(self) -> float:
         """Time between two states, s."""
         return 1.0 / self._host.spec.rate_hz
@@ -153,8 +158,8 @@ class Gripper:
     ) -> GripperMotion:
         """Start to close on an object and hold it.
 
-        The object counts as held if the fingers end between ``width - inner`` and ``width + outer``; otherwise the
-        outcome is ``MISSED``.
+        The fingers are asked to close, whatever the width, so that they press: ``width_target`` is 0. The object counts
+        as held if they end between ``width - inner`` and ``width + outer``; otherwise the outcome is ``MISSED``.
 
         Args:
             width: Expected width of the object, m.
@@ -185,7 +190,7 @@ class Gripper:
         return (
             number("width", width, "m", least=0.0, most=self.spec.width_max),
             number("speed", speed, "m/s", least=0.0, above=True, most=self.spec.speed),
-            number("force", force, "N", least=0.0, above=True, most=self.spec.force_max or self.spec.force),
+            number("force", force, "N", least=0.0, above=True, most=self.force_max),
         )
 
     def _start_motion(self, act: GripperAct, *numbers: float) -> GripperMotion:
@@ -196,7 +201,7 @@ class Gripper:
             self._motion = GripperMotion(self, self._put(stops, act, *numbers))
             return self._motion
 
-    def _send(self, session: int, width: float) -> int:
+    def _send(self, session: int, width: float, force: float) -> int:
         """Start a motion from a control loop: no error if the gripper does not answer, and no wait.
 
         Returns:
@@ -205,8 +210,7 @@ class Gripper:
         stops = self._latch.stops
         if self._latch.stopped:
             return 0
-        spec = self.spec
-        return self._put(stops, GripperAct.MOVE, width, spec.speed, spec.force, session=session)
+        return self._put(stops, GripperAct.MOVE, width, self.spec.speed, force, session=session)
 
     def _was_stopped(self, number: int) -> bool:
         """Return whether the newest command is the one of this number, and was stopped before its end."""

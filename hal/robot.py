@@ -83,6 +83,8 @@ class Robot:
         self._dynamics: Dynamics | None = None
         self.gripper = gripper
         """Gripper on this arm; None if the model has none."""
+        self.recorded = False
+        """Whether a recorder records an episode: motions then keep the speed of streams, so that it can be replayed."""
 
     # The arm itself.
 
@@ -303,7 +305,8 @@ class Robot:
             straight: Move the tcp on a straight line; only for a pose or a position.
             deadman: Switch that must be held; the arm waits for it and pauses while it is released.
             unattended: Move an arm that really moves without a dead-man.
-            speed: Share of the joint speed limits, up to 1; the rig's ``move_speed`` (0.1) by default.
+            speed: Share of the joint speed limits, up to 1; the rig's ``move_speed`` (0.1) by default. In an episode
+                that is recorded, up to the rig's ``speed``, with a warning.
             tcp_speed: Greatest speed of the tcp, m/s, up to the rig's own, which is the default.
             timeout: Longest duration, s; None for no limit.
             patience: Longest time for which the dead-man may be released, s.

@@ -280,7 +280,9 @@ class GripperState:
     width: float
     """Distance between the fingers, m."""
     width_target: float
-    """Width of the newest command, m."""
+    """Width that the newest command asked of the fingers, m: 0 after a grasp, whose fingers press beyond the object."""
+    force_target: float
+    """Force of the newest command, N; the gripper's default before the first."""
     moving: bool
     grasped: bool | None
     """Whether the fingers press on an object; None if unknown."""

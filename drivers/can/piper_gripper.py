@@ -115,23 +115,16 @@ class PiperGripper(GripperDriver):
             self._seq += 1
 
     def move(self, width: float, speed: float, force: float) -> None:
-        self._start(width, width, speed, force)
-
-    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
-        """Close until an object, or the other finger, stops the fingers."""
-        self._start(width, 0.0, speed, force)
-
-    def _start(self, target: float, goal: float, speed: float, force: float) -> None:
         self._link.send(())  # raises if it is lost
         status = self._status
         assert status is not None
         widest = self.spec.width_max
-        self._target, self._goal = min(max(target, 0.0), widest), min(max(goal, 0.0), widest)
-        width = min(max(status.width, 0.0), widest)
+        self._target = self._goal = min(max(width, 0.0), widest)
+        present = min(max(status.width, 0.0), widest)
         if self._ramp is None or not status.flags & ENABLED:
-            self._ramp = width
+            self._ramp = present
         elif self._goal > self._ramp:  # fingers that an object stopped start to open where they are
-            self._ramp = min(max(self._ramp, width), self._goal)
+            self._ramp = min(max(self._ramp, present), self._goal)
         self._speed = min(speed, self.spec.speed)
         self._torque = min(max(force / self.settings.force_per_torque, 0.0), _LARGEST_TORQUE)
         self._stopped = False

@@ -137,8 +137,9 @@ class FrankaHand(GripperDriver):
     def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
         """Close on an object and hold it. A hand that holds one already accepts only the same force."""
         self._check(width, speed, force, inner, outer)
-        self._target = min(max(width, 0.0), self.spec.width_max)
-        self._controller.grasp(self._target, min(speed, self.spec.speed), force, inner, outer)
+        self._target = 0.0
+        width = min(max(width, 0.0), self.spec.width_max)
+        self._controller.grasp(width, min(speed, self.spec.speed), force, inner, outer)
         self._process_events()
 
     def home(self) -> None:

@@ -220,7 +220,7 @@ class MockGripper(GripperDriver):
         self.homed = 0
         """Number of calls of ``home``."""
         self.is_open = False
-        self._width = self._target = self._aim = spec.width_max
+        self._width = self._target = spec.width_max
         self._speed = 0.0
         self._force = 0.0
         self._stopped = True
@@ -261,10 +261,10 @@ class MockGripper(GripperDriver):
     def _goal(self) -> float:
         """Return the width at which the motion ends: the commanded one, or that of an object in between."""
         block = self.faults.object_width
-        return max(self._aim, block) if block is not None and self._width >= block else self._aim
+        return max(self._target, block) if block is not None and self._width >= block else self._target
 
     def _pressing(self) -> bool:
-        return self.faults.object_width is not None and self._aim < self.faults.object_width == self._width
+        return self.faults.object_width is not None and self._target < self.faults.object_width == self._width
 
     def _advance(self, dt: float) -> None:
         if self._stopped or self.faults.stuck:
@@ -276,28 +276,27 @@ class MockGripper(GripperDriver):
     def move(self, width: float, speed: float, force: float) -> None:
         self._expect_open()
         self.log.append((width, speed, force))
-        width = min(max(width, 0.0), self.spec.width_max)
-        self._start(width, width, speed, force)
+        self._start(min(max(width, 0.0), self.spec.width_max), speed, force)
 
     def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
         """Close until an object, or the other finger, stops the fingers."""
         self._expect_open()
         self.log.append((width, speed, force))
-        self._start(min(max(width, 0.0), self.spec.width_max), 0.0, speed, force)
+        self._start(0.0, speed, force)
 
     def home(self) -> None:
         """Open completely."""
         self._expect_open()
         self.homed += 1
-        self._start(self.spec.width_max, self.spec.width_max, self.spec.speed, self.spec.force)
+        self._start(self.spec.width_max, self.spec.speed, self.spec.force)
 
-    def _start(self, target: float, aim: float, speed: float, force: float) -> None:
+    def _start(self, target: float, speed: float, force: float) -> None:
         failure = self.faults.fail
         self._fault = None if failure is None else Fault("mock", failure, "set the fault 'fail' back to None")
         if failure is not None:
             self._stopped = True
             return
-        self._target, self._aim = target, aim
+        self._target = target
         self._speed = min(speed, self.spec.speed)
         self._force = force
         self._stopped = False

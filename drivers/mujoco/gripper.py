@@ -30,7 +30,7 @@ class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
 
     def _drive(self, speed: float) -> None:
         motors, at, travel = self._world.motors, self._at, self._travel
-        targets, speeds = travel.positions(self._aim), travel.speeds(speed)
+        targets, speeds = travel.positions(self._target), travel.speeds(speed)
         motors.target[at], motors.feed[at] = targets, 0.0
         motors.efforts[at], motors.speeds[at] = travel.efforts(self._force), speeds
         if self._followers is not None:  # their couplings move them; the law of the motors has to expect it

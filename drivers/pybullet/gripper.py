@@ -31,7 +31,7 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
         client, travel = self._world.client, self._travel
         drives = zip(
             self._joints,
-            travel.positions(self._aim),
+            travel.positions(self._target),
             travel.efforts(self._force),
             travel.speeds(speed),
             strict=True,
@@ -52,7 +52,7 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
         if self._driven is not None:
             self._drive(self._driven)
         else:
-            targets = dict(zip(self._joints, self._travel.positions(self._aim), strict=True))
+            targets = dict(zip(self._joints, self._travel.positions(self._target), strict=True))
             hold(self._world.client, self._body, targets, self._world.dt)
 
     def _width(self) -> tuple[float, float, float, float]:

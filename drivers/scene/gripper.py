@@ -30,7 +30,7 @@ BLOCKED = 0.25
 PRESSING = 0.5
 """Share of the commanded force from which on the fingers count as pressing on something."""
 
-_KEPT = ("target", "aim", "force", "stood", "settle", "resting", "speed", "driven")
+_KEPT = ("target", "force", "stood", "settle", "resting", "speed", "driven")
 """Attributes that a saved state has."""
 
 W = TypeVar("W", bound=SimulatedWorld)  # type: ignore[type-arg]  # of any kind of body
@@ -105,7 +105,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._world: W = world  # type: ignore[assignment]  # of that class
         self._travel = FingerTravel(spec)
         self._open = False
-        self._target = self._aim = spec.width_max
+        self._target = spec.width_max
         self._force = spec.force
         self._stood = 0.0
         """Width near which the fingers have stayed, m."""
@@ -136,7 +136,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     @abstractmethod
     def _drive(self, speed: float) -> None:
-        """Drive the fingers to the width :attr:`_aim` with :attr:`_force`; ``speed`` is that of the width, m/s."""
+        """Drive the fingers to the width :attr:`_target` with :attr:`_force`; ``speed`` is that of the width, m/s."""
 
     @abstractmethod
     def _handle(self, active: bool) -> None:
@@ -145,7 +145,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     def _resume(self) -> None:  # optional
         """Let the motors do what they did when a state was saved, if the engine's states are without those of motors.
 
-        They moved at :attr:`_driven` to :attr:`_aim`, or held there since a reset.
+        They moved at :attr:`_driven` to :attr:`_target`, or held there since a reset.
         """
 
     # --- the driver --------------------------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             width, speed, force, load = self._stood, 0.0, 0.0, 0.0
         moving = not self._at_rest(width, speed)
         pressing = force >= PRESSING * self._force
-        idle = not moving and abs(width - self._aim) <= AT_TARGET and load < PRESSING * self._force
+        idle = not moving and abs(width - self._target) <= AT_TARGET and load < PRESSING * self._force
         self._handle(not idle)
         return GripperReading(
             t=now,
@@ -177,7 +177,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             width=width,
             width_target=self._target,
             moving=moving,
-            grasped=not moving and pressing and width > self._aim + AT_TARGET,
+            grasped=not moving and pressing and width > self._target + AT_TARGET,
             force=force,
         )
 
@@ -191,12 +191,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def move(self, width: float, speed: float, force: float) -> None:
         """Start a motion to ``width``, clipped to the gripper's range; the newest command wins."""
-        self._target = self._aim = min(max(width, 0.0), self.spec.width_max)
-        self._start(speed, force)
-
-    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
-        """Start to close until something, or the other finger, stops the fingers; they go on pressing."""
-        self._target, self._aim = min(max(width, 0.0), self.spec.width_max), 0.0
+        self._target = min(max(width, 0.0), self.spec.width_max)
         self._start(speed, force)
 
     def _expect_open(self) -> None:
@@ -226,7 +221,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             self._stood, self._stood_since = width, step
         elif stood_long:
             self._resting = True
-        return self._resting or (abs(width - self._aim) <= AT_TARGET and abs(speed) <= SLOW)
+        return self._resting or (abs(width - self._target) <= AT_TARGET and abs(speed) <= SLOW)
 
     def stop(self) -> None:
         """Stop the fingers where they are; on an object, they continue to press."""
@@ -234,7 +229,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         width, speed, force, _ = self._measure()
         if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
             return
-        self._target = self._aim = width
+        self._target = width
         self._handle(True)
         self._driven = self.spec.speed
         self._drive(self._driven)
@@ -261,7 +256,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def _was_reset(self) -> None:
         self._driven = None
-        self._target = self._aim = self._stood = self._width()[0]
+        self._target = self._stood = self._width()[0]
         self._resting, self._stood_since = True, self._world.steps
         self._force = self.spec.force
         self._placed = (self._world.steps, 0.0, 0.0)

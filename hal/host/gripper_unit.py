@@ -37,6 +37,8 @@ class GripperUnit:
         self.mail = mail
         self._reading: GripperReading | None = None
         self._command: GripperCommand | None = None
+        self._force = self.spec.force
+        """Force of the newest motion, N."""
         self._seq = 0
         self._seq_before = 0
         """Number of the last reading before the newest command."""
@@ -116,6 +118,7 @@ class GripperUnit:
         self._outcome, self._final, self._fault = GripperOutcome.RUNNING, False, None
         self._seq_before = self._reading.seq if self._reading is not None else -1
         try:
+            self._force = command.force or self._force
             if command.act is GripperAct.MOVE:
                 self.driver.move(command.width, command.speed, command.force)
             elif command.act is GripperAct.GRASP:
@@ -164,7 +167,7 @@ class GripperUnit:
             self._judge(reading)
         if self._reading is not None:
             fault = self._fault or lost or self._reading.fault
-            self.mail.put(self._reading, self._seq, self._outcome, fault, lost is not None)
+            self.mail.put(self._reading, self._seq, self._outcome, fault, lost is not None, self._force)
 
     def _judge(self, reading: GripperReading) -> None:
         """Decide how the newest command goes: by the driver's outcome, or else by the width."""

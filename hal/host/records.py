@@ -223,7 +223,7 @@ def _known(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 _GRIPPER_COMMAND = "QQQB5d"
-_GRIPPER_STATE = "ddQdd?bdQB?"
+_GRIPPER_STATE = "ddQddd?bdQB?"
 _GRIPPER_LAYOUT = struct.Struct("<" + _GRIPPER_STATE + FAULT_FORMAT)
 GRIPPER_STATES = 512
 """Number of states of a gripper that stay readable: 2 s at 240 Hz, 5 s at 100 Hz."""
@@ -295,6 +295,7 @@ class GripperMail:
         outcome: GripperOutcome = GripperOutcome.NONE,
         fault: Fault | None = None,
         lost: bool = False,
+        force: float = math.nan,
     ) -> None:
         """Publish a reading.
 
@@ -304,10 +305,11 @@ class GripperMail:
             outcome: How that command goes.
             fault: Why it failed, or why the gripper does not answer.
             lost: Whether the device did not answer; ``reading`` is then an older one.
+            force: Force of that command, N.
         """
         grasped = _UNKNOWN if reading.grasped is None else (_YES if reading.grasped else _NO)
-        force = math.nan if reading.force is None else reading.force
-        values = (*reading[:6], grasped, force, target_seq, outcome, lost)  # reading: t .. moving
+        pressed = math.nan if reading.force is None else reading.force
+        values = (*reading[:5], force, reading.moving, grasped, pressed, target_seq, outcome, lost)  # t .. width_target
         self.state.write(*values, *fault_values(fault))
 
 
@@ -317,11 +319,12 @@ def _command(values: tuple[Any, ...]) -> GripperCommand:
 
 
 def _record(values: tuple[Any, ...]) -> GripperRecord:
-    t, t_device, seq, width, target, moving, grasped, force, target_seq, outcome, lost, *fault = values
+    t, t_device, seq, width, target, asked, moving, grasped, force, target_seq, outcome, lost, *fault = values
     state = GripperState(
         stamp=Stamp(t, t_device, seq),
         width=width,
         width_target=target,
+        force_target=asked,
         moving=moving,
         grasped=None if grasped == _UNKNOWN else grasped == _YES,
         force=None if math.isnan(force) else force,

@@ -14,6 +14,7 @@ from ..commands import JointChunk
 from ..control import Control
 from ..errors import CommandError, DatasetError
 from ..geometry import Pose
+from ..recording.layout import GRIP_FORCE
 from ..types import Limited, RobotStatus
 
 if TYPE_CHECKING:
@@ -61,8 +62,9 @@ class RecordedTrajectory:
     """(k, n) measured positions, rad."""
     tcp: Array
     """(k, 3) measured positions of the tcp in the base frame, m."""
-    width: Array | None
-    """(k,) commanded widths of the gripper, m; None without one."""
+    grip: Array | None
+    """(k, 2) commanded widths, m, and forces, N, of the gripper; None without one. A force is NaN where the recording
+    lacks it."""
     objects: Mapping[str, Pose]
     """Poses of the objects in the first row, in the world; simulation only."""
 
@@ -99,10 +101,13 @@ class RecordedTrajectory:
         later = np.append(True, np.diff(np.maximum.accumulate(t)) > 0.0)
 
         def rows(key: str, which: Any) -> Array:
-            values: Array = np.asarray(episode.columns[key], float)[later][:, which]
+            values: Array = np.asarray(episode.columns[key], float).reshape(len(t), -1)[later][:, which]
             return values
 
         setpoint = rows("rig.setpoint", own)
+        forces = np.full(len(setpoint), np.nan)
+        if has_gripper and GRIP_FORCE in episode.columns:
+            forces = rows(GRIP_FORCE, episode.names(GRIP_FORCE).index(f"{lead}gripper"))
         return cls(
             joints=tuple(joints),
             model=_model(episode.info, key.removeprefix("robot.")),
@@ -110,7 +115,7 @@ class RecordedTrajectory:
             q_set=setpoint[:, :n],
             q=rows("observation.state", own)[:, :n],
             tcp=rows("observation.tcp", slice(first, first + 3)),
-            width=setpoint[:, n] if has_gripper else None,
+            grip=np.stack([setpoint[:, n], forces], axis=1) if has_gripper else None,
             objects=_objects(episode.columns),
         )
 
@@ -142,7 +147,7 @@ class RecordedTrajectory:
             return [f"it was recorded with the model {self.model}, and this arm is a {robot.spec.model}"]
         if self.joints != robot.joints:
             return [f"it was recorded with the joints {', '.join(self.joints)}; this arm has {', '.join(robot.joints)}"]
-        if self.width is not None and robot.gripper is None:
+        if self.grip is not None and robot.gripper is None:
             return ["it was recorded with a gripper, and this arm has none"]
         return []
 
@@ -160,6 +165,10 @@ class RecordedTrajectory:
             if values.min() < low - _ROUNDED or values.max() > high + _ROUNDED:
                 span = f"{values.min():.3f}..{values.max():.3f} rad"
                 found.append(f"{name} goes through {span}, and its limits here are {low:g}..{high:g}")
+        if self.grip is not None and robot.gripper is not None:
+            most, force = robot.gripper.force_max, float(np.nanmax(self.grip[:, 1], initial=0.0))
+            if force > most + _ROUNDED:
+                found.append(f"the fingers press with {force:g} N, and with at most {most:g} N here")
         return found
 
     def _too_fast(self, robot: Robot, speed: float) -> list[str]:
@@ -191,12 +200,12 @@ class RecordedTrajectory:
         mixed: Array = values[k - 1] + share * (values[k] - values[k - 1])
         return mixed
 
-    def width_at(self, s: float) -> float | None:
-        """Return the gripper's last commanded width at ``s``, m; None without one."""
-        if self.width is None:
+    def grip_at(self, s: float) -> tuple[float, float | None] | None:
+        """Return the gripper's last commanded width, m, and force, N, at ``s``; None for what is not known."""
+        if self.grip is None:
             return None
-        value = float(self.width[max(0, int(np.searchsorted(self.t, s, side="right")) - 1)])
-        return value if np.isfinite(value) else None
+        width, force = self.grip[max(0, int(np.searchsorted(self.t, s, side="right")) - 1)].tolist()
+        return (width, force if math.isfinite(force) else None) if math.isfinite(width) else None
 
 
 def recorded_arms(episode: Episode) -> list[str]:
@@ -467,6 +476,9 @@ class TrajectoryPlayer:
         return seen
 
     def _grip(self, control: Control) -> None:
-        gripper, width = self.robot.gripper, self.trajectory.width_at(self.progress)
-        if gripper is not None and width is not None:
-            control.send(None, width=float(np.clip(width, 0.0, gripper.width_max)))
+        gripper, grip = self.robot.gripper, self.trajectory.grip_at(self.progress)
+        if gripper is not None and grip is not None:
+            width, force = grip
+            if force is not None:
+                force = min(force, gripper.force_max)
+            control.send(None, width=float(np.clip(width, 0.0, gripper.width_max)), force=force)

@@ -30,6 +30,7 @@ __all__ = [
     "MOVES",
     "DatasetLayout",
     "EpisodePlace",
+    "GRIP_FORCE",
     "GROUP",
     "MORE_STREAMS",
     "PAD",
@@ -64,6 +65,8 @@ ACTION = "action"
 SETPOINT = "rig.setpoint"
 """LeRobot treats columns whose names begin with ``observation`` or ``action`` as inputs and outputs of a policy. What a
 policy must not learn from, because it contains the answer or is unknown on a robot, begins with ``rig``."""
+GRIP_FORCE = "rig.setpoint_force"
+"""Force that was asked of each gripper, N."""
 PAD = "rig.pad"
 SUCCESS = "next.success"
 SOURCE = "source"

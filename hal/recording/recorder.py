@@ -21,11 +21,11 @@ from .checking import check_compatible
 from .codecs import VideoEncoder
 from .finish import write_mark
 from .index import read_index
-from .layout import MORE_STREAMS, TIMES, DatasetLayout, features_of, lock_dataset, require_libraries
+from .layout import DatasetLayout, features_of, lock_dataset, require_libraries
 from .live import RowQueue
 from .merging import pack_if_loose
 from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
-from .sampling import CameraBuffer, LockStepSampleClock, RealTimeSampleClock, RowSampler, SampleClock
+from .sampling import CameraBuffer, LockStepSampleClock, RealTimeSampleClock, RowSampler, SampleClock, select_devices
 
 if TYPE_CHECKING:
     from ..rig import Rig
@@ -38,7 +38,6 @@ __all__ = [
     "RecorderStatus",
     "BackgroundSave",
     "check_rate",
-    "select_devices",
 ]
 
 _LOG = logging.getLogger("hal.recording")
@@ -265,6 +264,7 @@ class Recorder:
                 self._stop_cameras()
                 raise
             self._current, self._is_open = episode, True
+            self._sampler.mark_arms(True)
 
     def status(self) -> RecorderStatus:
         """Return the current state. Never blocks."""
@@ -340,6 +340,7 @@ class Recorder:
         if self._current is None or not self._is_open:
             raise CommandError("no episode is being recorded: call start first", code="no_episode")
         self._is_open = False
+        self._sampler.mark_arms(False)
         self._current.end()
         return self._current
 
@@ -547,54 +548,3 @@ def check_rate(rig: Rig, fps: int) -> None:
         raise CommandError(
             f"fps must be at most {steps:g}, the steps of this simulation per second, not {fps}", code="bad_fps"
         )
-
-
-def select_devices(
-    rig: Rig, cameras: Collection[str] | None, streams: Collection[str]
-) -> tuple[RowSampler, list[CameraBuffer], list[str]]:
-    """Return what is recorded of a rig.
-
-    Args:
-        rig: An open rig.
-        cameras: Names of the cameras; None for all.
-        streams: Streams to record of the cameras that have them.
-
-    Returns:
-        The sampler of all arms and pads, a buffer per camera, and notes for the operator.
-
-    Raises:
-        CommandError: Something cannot be recorded.
-        StaleStateError: The state of an arm is not available.
-        ConnectionLost: A device is lost.
-    """
-    if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
-        known = ", ".join(("color", "depth", *MORE_STREAMS))
-        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}", code="unknown_stream")
-    if not rig.robots:
-        raise CommandError("this rig has no arm to record", code="no_arm")
-    names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
-    buffers, notes = [], []
-    for name in names:
-        buffer = CameraBuffer(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
-        setup = buffer.setup
-        if setup.videos and (setup.width % 2 or setup.height % 2):
-            size = f"{setup.width}x{setup.height}"
-            raise CommandError(
-                f"the size of a video must be even: change cameras.{name}.output, which is {size}", code="odd_size"
-            )
-        if setup.videos or setup.depths:
-            buffers.append(buffer)
-        own = rig.cameras[name].spec.streams
-        if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
-            notes.append(f"camera {name}: {', '.join(left)} not recorded")
-        if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
-            notes.append(f"camera {name} has no {', '.join(missing)}")
-    for files in ([buffer.setup.videos for buffer in buffers], [buffer.setup.depths for buffer in buffers]):
-        file_names = [name for each in files for name in each]
-        if double := [name for name in file_names if file_names.count(name) > 1]:
-            raise CommandError(f"two streams would be called {double[0]}: rename a camera", code="duplicate_name")
-    sampler = RowSampler(rig, [buffer.camera.name for buffer in buffers])
-    for buffer in buffers:
-        seq = sampler.place_of(f"{TIMES}camera.{buffer.camera.name}") + 2
-        buffer.setup = buffer.setup._replace(seq=seq)
-    return sampler, buffers, notes

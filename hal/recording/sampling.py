@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from ..clock import LockStepClock
-from ..errors import ConnectionLost, DeviceNotFound, StaleStateError
+from ..errors import CommandError, ConnectionLost, DeviceNotFound, StaleStateError
 from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, Stamp
 from .codecs import depth_unit_for
-from .layout import GRID, MORE_STREAMS, PAD, SETPOINT, SOURCE, SOURCES, STATE, TIMES, CameraSetup, Column
+from .layout import GRID, GRIP_FORCE, MORE_STREAMS, PAD, SETPOINT, SOURCE, SOURCES, STATE, TIMES, CameraSetup, Column
 
 if TYPE_CHECKING:
     from ..camera import Camera
@@ -39,6 +39,7 @@ __all__ = [
     "RealTimeSampleClock",
     "RowSampler",
     "movable_objects",
+    "select_devices",
 ]
 
 LAG = 0.1
@@ -349,6 +350,11 @@ class RowSampler:
         self.width = sum(len(column.names) for column in self.columns)
         """Numbers in a row."""
 
+    def mark_arms(self, recorded: bool) -> None:
+        """Note in each arm whether an episode is recorded."""
+        for robot in self._rig.robots.values():
+            robot.recorded = recorded
+
     def place_of(self, key: str) -> int:
         """Return the index of a column's first number in a row."""
         keys = [column.key for column in self.columns]
@@ -372,6 +378,7 @@ class RowSampler:
         self._add("rig.status", [lead + name for name in ("status", "trip", "limited")], "int64")
         self._add(f"{TIMES}robot.{robot.name}", _STAMP, "float64")
         if finger:
+            self._add(GRIP_FORCE, finger)
             self._add(f"{TIMES}gripper.{robot.name}", _STAMP, "float64")
 
     def read_snapshot(self) -> RowSnapshot:
@@ -439,7 +446,59 @@ class RowSampler:
         put("rig.status", [float(state.status), float(state.trip), float(state.limited)])
         put(f"{TIMES}robot.{robot.name}", _stamp(state.stamp))
         for grip in grips:
+            put(GRIP_FORCE, [grip.force_target])
             put(f"{TIMES}gripper.{robot.name}", _stamp(grip.stamp))
+
+
+def select_devices(
+    rig: Rig, cameras: Collection[str] | None, streams: Collection[str]
+) -> tuple[RowSampler, list[CameraBuffer], list[str]]:
+    """Return what is recorded of a rig.
+
+    Args:
+        rig: An open rig.
+        cameras: Names of the cameras; None for all.
+        streams: Streams to record of the cameras that have them.
+
+    Returns:
+        The sampler of all arms and pads, a buffer per camera, and notes for the operator.
+
+    Raises:
+        CommandError: Something cannot be recorded.
+        StaleStateError: The state of an arm is not available.
+        ConnectionLost: A device is lost.
+    """
+    if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
+        known = ", ".join(("color", "depth", *MORE_STREAMS))
+        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}", code="unknown_stream")
+    if not rig.robots:
+        raise CommandError("this rig has no arm to record", code="no_arm")
+    names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
+    buffers, notes = [], []
+    for name in names:
+        buffer = CameraBuffer(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
+        setup = buffer.setup
+        if setup.videos and (setup.width % 2 or setup.height % 2):
+            size = f"{setup.width}x{setup.height}"
+            raise CommandError(
+                f"the size of a video must be even: change cameras.{name}.output, which is {size}", code="odd_size"
+            )
+        if setup.videos or setup.depths:
+            buffers.append(buffer)
+        own = rig.cameras[name].spec.streams
+        if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
+            notes.append(f"camera {name}: {', '.join(left)} not recorded")
+        if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
+            notes.append(f"camera {name} has no {', '.join(missing)}")
+    for files in ([buffer.setup.videos for buffer in buffers], [buffer.setup.depths for buffer in buffers]):
+        file_names = [name for each in files for name in each]
+        if double := [name for name in file_names if file_names.count(name) > 1]:
+            raise CommandError(f"two streams would be called {double[0]}: rename a camera", code="duplicate_name")
+    sampler = RowSampler(rig, [buffer.camera.name for buffer in buffers])
+    for buffer in buffers:
+        seq = sampler.place_of(f"{TIMES}camera.{buffer.camera.name}") + 2
+        buffer.setup = buffer.setup._replace(seq=seq)
+    return sampler, buffers, notes
 
 
 def _gripper_state(robot: Robot, t: float) -> GripperState:

@@ -101,18 +101,13 @@ def test_a_grippers_command_and_state_arrive() -> None:
     assert host.get_command() == command
     fault = Fault("hot", "it is too hot \u2717", "let it cool down")
     reading = GripperReading(3.0, 4.0, 9, 0.031, 0.03, True, True, 12.5)
-    host.put(reading, 7, GripperOutcome.FAILED, fault, lost=True)
+    host.put(reading, 7, GripperOutcome.FAILED, fault, True, 20.0)
     found = app.get()
     assert found.lost
     state = found.state
     assert (state.stamp.t, state.stamp.t_device, state.stamp.seq) == (3.0, 4.0, 9)
-    assert (state.width, state.width_target, state.moving, state.grasped, state.force) == (
-        0.031,
-        0.03,
-        True,
-        True,
-        12.5,
-    )
+    assert (state.width, state.width_target, state.force_target) == (0.031, 0.03, 20.0)
+    assert (state.moving, state.grasped, state.force) == (True, True, 12.5)
     assert (state.outcome, state.fault, state.target_seq) == (GripperOutcome.FAILED, fault, 7)
     host.put(GripperReading(3.1, 4.1, 10, 0.031, 0.03, False))
     found = app.get()

@@ -27,7 +27,8 @@ class Recorded:
     joints: tuple[str, ...] = ()
 
     def names(self, key: str) -> list[str]:
-        return ["x", "y", "z", "qx", "qy", "qz", "qw"] if key == "observation.tcp" else [*self.joints, "gripper"]
+        other = {"observation.tcp": ["x", "y", "z", "qx", "qy", "qz", "qw"], "rig.setpoint_force": ["gripper"]}
+        return other.get(key, [*self.joints, "gripper"])
 
 
 def opened(driver: str, **options: Any) -> hal.Rig:
@@ -45,9 +46,8 @@ def twist(t: float) -> hal.Twist:
 
 def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = None) -> Recorded:
     """Drive, close the hand half-way, and keep a row at every turn."""
-    rows: dict[str, list[Any]] = {
-        key: [] for key in ("rig.setpoint", "observation.state", "observation.tcp", "rig.object.cube")
-    }
+    names = ("rig.setpoint", "rig.setpoint_force", "observation.state", "observation.tcp", "rig.object.cube")
+    rows: dict[str, list[Any]] = {key: [] for key in names}
     stamps = []
     with opened(driver) as rig:
         arm = rig.robots["panda"]
@@ -60,6 +60,7 @@ def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = N
                 state, hand = arm.state(), arm.gripper.state()
                 stamps.append(state.stamp.t)
                 rows["rig.setpoint"].append([*state.q_set, hand.width_target])
+                rows["rig.setpoint_force"].append([hand.force_target])
                 rows["observation.state"].append([*state.q, hand.width])
                 rows["observation.tcp"].append([*state.tcp.position, *state.tcp.orientation])
                 if rig.has_world:
@@ -265,7 +266,7 @@ def test_one_arm_of_two_is_found_by_its_name(episode: Recorded) -> None:
         two = Two(both, {"robot.left": 0.0 * episode.stamps["robot.panda"], **episode.stamps}, {}, episode.joints)
         trajectory = course_of(two, arm)
         assert trajectory.joints == single.joints
-        for name in ("t", "q_set", "q", "tcp", "width"):
+        for name in ("t", "q_set", "q", "tcp", "grip"):
             assert getattr(trajectory, name) == pytest.approx(getattr(single, name))
         assert recorded_arms(two) == ["left", "panda"]  # type: ignore[arg-type]
         assert other_moving_arms(two, "panda") == [], "the other one stood still"  # type: ignore[arg-type]

@@ -89,8 +89,8 @@ def exported(episode: Episode, folder: Path, rig: Rig) -> Arrays:
 def replayed(episode: Episode, folder: Path, rig: Rig) -> Arrays:
     check_rows(episode, None)
     course = RecordedTrajectory.from_episode(episode, rig.robots["panda"])
-    assert course.width is not None
-    return {"t": course.t, "q_set": course.q_set, "width": course.width}
+    assert course.grip is not None
+    return {"t": course.t, "q_set": course.q_set, "grip": course.grip}
 
 
 def drawn(episode: Episode, folder: Path, rig: Rig) -> Arrays:
