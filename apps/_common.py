@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import logging
 import os
 import signal
@@ -471,10 +472,13 @@ def _discard_output() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Replace missing standard streams, as of a program that a scheduler started, by ones that lead nowhere."""
+    """Let output never fail for a missing stream, as of a program that a scheduler started, or for a letter."""
     from hal.host.process import fill_standard_descriptors
 
     fill_standard_descriptors()
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115  # used until the program ends
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a path may have letters that this terminal has not

@@ -332,6 +332,8 @@ def missing(name: str, device: object = None) -> dict[str, str]:
 def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
     """Return the attribute at "module:ATTRIBUTE"; errors are reported as those of the driver ``name``."""
     module_name, _, attribute = place.partition(":")
+    if not module_name or not attribute:
+        raise DriverMissing(f"driver {name!r} is not written as module:CLASS", code="bad_driver")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:

@@ -230,7 +230,7 @@ def _with_length(direction: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Flag = Annotated[bool, Field(strict=True)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
+Name = Annotated[str, Field(pattern=r"^_?[A-Za-z][A-Za-z0-9_-]*$")]
 Pixels = Annotated[int, Field(strict=True, gt=0, le=16384)]
 
 # Every number of a rig, a model, an object or a mapping is one of these. The ranges include everything that fits on one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -53,3 +54,28 @@ def test_output_that_nothing_reads_ends_the_program_quietly(command: str, tmp_pa
     done = shell(f"(sleep 0.3; exec {command}) | true; exit ${{PIPESTATUS[0]}}", tmp_path)
     assert done.returncode == 1
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("robots", "word"),
+    [
+        ('{arm: {model: panda, drivers: {sim: ":"}}}', "module:CLASS"),
+        ("{__proto__: {model: panda}}", "robots.__proto__"),
+        ("{arm: {model: panda}}", ""),
+    ],
+)
+def test_a_wrong_rig_is_a_message_also_on_a_terminal_without_its_letters(
+    tmp_path: Path, robots: str, word: str
+) -> None:
+    folder = tmp_path / "lab_\u00fc"
+    folder.mkdir()
+    (folder / "rig.yaml").write_text(f"robots: {robots}\n")
+    command = [sys.executable, "-m", "hal.apps.teleop", "--sim", "--dry-run", "--config", str(folder / "rig.yaml")]
+    done = subprocess.run(
+        command, env=os.environ | {"PYTHONIOENCODING": "ascii"}, capture_output=True, text=True, timeout=60
+    )
+    printed = done.stdout + done.stderr
+    assert "Traceback" not in printed
+    assert "lab_\\xfc" in printed
+    assert word in printed
+    assert (done.returncode == 0) == (not word)
