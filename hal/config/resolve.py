@@ -57,6 +57,7 @@ def resolve(context: Context) -> Plan:
     boxes: tuple[BoxSpec, ...] = ()
     with suppress(Unknown):
         boxes = tuple(_boxes(context, bodies))
+        context.warnings += _unguarded(bodies, boxes)
     context.problems.raise_any()
     wanted = rig.collisions
     physics = rig.simulation
@@ -89,6 +90,18 @@ def _boxes(context: Context, bodies: Iterable[BodySpec]) -> Iterator[BoxSpec]:
             context.problem(key, message, "unknown_object")
 
 
+def _unguarded(bodies: Iterable[BodySpec], boxes: Iterable[BoxSpec]) -> Iterator[str]:
+    """Yield a warning for each object that stands fixed in the way and that no box stands for."""
+    named = {box.name for box in boxes}
+    for body in bodies:
+        if _is_fixed(body) and body.collision and body.shape != "plane" and body.name not in named:
+            yield f"{body.name} is fixed, and no box of `collisions` has its name: no motion into it is refused"
+
+
+def _is_fixed(body: BodySpec) -> bool:
+    return body.robot is None and (body.fixed or (body.urdf is None and body.mass == 0.0))
+
+
 def _boxes_of(context: Context, key: str, body: BodySpec) -> Iterator[BoxSpec]:
     """Yield the boxes of an object, which must be fixed and consist of boxes."""
     pose = Pose(body.position, body.orientation)
@@ -108,7 +121,7 @@ def _boxes_of(context: Context, key: str, body: BodySpec) -> Iterator[BoxSpec]:
         )
         context.problem(key, message, "wrong_shape")
         return
-    if body.robot is not None or not (body.fixed or (body.urdf is None and body.mass == 0.0)):
+    if not _is_fixed(body):
         context.problem(key, f"{body.name!r} can move: only objects that are fixed can be given here", "wrong_shape")
         return
     for at, size in shapes:

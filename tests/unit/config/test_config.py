@@ -476,3 +476,11 @@ def test_shipped_rigs_name_the_schema_and_fit_it(name: str) -> None:
     validator.validate(yaml.safe_load(text))
     with pytest.raises(ValidationError):
         validator.validate(yaml.safe_load(text) | {"robots": {"arm": {"modle": "panda"}}})
+
+
+@pytest.mark.parametrize(("boxes", "count"), [([], 1), (["table"], 0)])
+def test_a_fixed_object_without_a_box_is_a_warning(boxes: list[str], count: int) -> None:
+    rig = {"robots": {"arm": {"model": "panda"}}, "objects": ["floor", "table", "cube"], "collisions": {"boxes": boxes}}
+    found = plan(rig).warnings
+    assert len(found) == count
+    assert all("table is fixed" in text for text in found)
