@@ -35,6 +35,7 @@ __all__ = [
     "check_index",
     "check_rows",
     "format_differences",
+    "known_columns",
 ]
 
 
@@ -223,6 +224,15 @@ def _no_constant(name: str) -> Any:
 
 _SAID_ELSEWHERE = ("video.fps", "video.width", "video.height")
 """Entries of a video that the dataset's own fps, and the video's shape, repeat."""
+
+
+def known_columns(layout: DatasetLayout) -> dict[str, list[str]] | None:
+    """Return the names of the numbers in each column of a dataset; None if there is none yet, or it is damaged."""
+    with contextlib.suppress(DatasetError):
+        info = read_index(layout)
+        if info is not None:
+            return {key: list(feature.get("names") or []) for key, feature in info["features"].items()}
+    return None
 
 
 def check_compatible(

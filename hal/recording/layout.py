@@ -40,6 +40,7 @@ __all__ = [
     "SOURCES",
     "STATE",
     "SUCCESS",
+    "TAU_EXT",
     "TIMES",
     "VERSION",
     "VIDEO_MB",
@@ -53,6 +54,7 @@ __all__ = [
     "read_json",
     "require_libraries",
     "sync_to_disk",
+    "WRENCH_EXT",
     "video_key",
     "video_names",
     "write_json",
@@ -67,6 +69,8 @@ SETPOINT = "rig.setpoint"
 policy must not learn from, because it contains the answer or is unknown on a robot, begins with ``rig``."""
 GRIP_FORCE = "rig.setpoint_force"
 """Force that was asked of each gripper, N."""
+TAU_EXT, WRENCH_EXT = "rig.tau_ext", "rig.wrench_ext"
+"""External torques, Nm, and the external wrench at the tcp, N and Nm, as the arm estimates them."""
 PAD = "rig.pad"
 SUCCESS = "next.success"
 SOURCE = "source"

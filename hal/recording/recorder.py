@@ -17,7 +17,7 @@ from ..errors import CommandError, ConnectionLost, HalError, StaleStateError
 from ..host.hosts import groups_of
 from ..host.process import Child, SharedMemory
 from ..learning.episode import stands_in_world
-from .checking import check_compatible
+from .checking import check_compatible, known_columns
 from .codecs import VideoEncoder
 from .finish import write_mark
 from .index import read_index
@@ -132,7 +132,9 @@ class Recorder:
         """Returns who drives when a row is due: ``person``, ``policy``, ``program``; empty if that is unknown."""
         self.root = DatasetLayout(out).root
         self._selected = cameras, [stream for stream in streams if depth or stream != "depth"]
-        self._sampler, self._buffers, self.notes = select_devices(rig, *self._selected)
+        self._sampler, self._buffers, self.notes = select_devices(
+            rig, *self._selected, known_columns(DatasetLayout(out))
+        )
         """Messages for the operator: streams that are not recorded, episodes that were recovered."""
         self._warn_free = warn_free
         setups = [buffer.setup for buffer in self._buffers]
@@ -209,7 +211,7 @@ class Recorder:
             if self._is_open:
                 raise CommandError("save or discard the episode before switching rigs", code="episode_open")
             self.wait_saved()
-            sampler, buffers, _ = select_devices(rig, *self._selected)
+            sampler, buffers, _ = select_devices(rig, *self._selected, known_columns(DatasetLayout(self.root)))
             setups = [[buffer.setup for buffer in each] for each in (buffers, self._buffers)]
             if sampler.columns != self._sampler.columns or setups[0] != setups[1]:
                 raise CommandError("this rig has other columns or cameras than the recorder's", code="other_rig")

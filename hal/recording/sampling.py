@@ -11,7 +11,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,7 +20,21 @@ from ..clock import LockStepClock
 from ..errors import CommandError, ConnectionLost, DeviceNotFound, StaleStateError
 from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, Stamp
 from .codecs import depth_unit_for
-from .layout import GRID, GRIP_FORCE, MORE_STREAMS, PAD, SETPOINT, SOURCE, SOURCES, STATE, TIMES, CameraSetup, Column
+from .layout import (
+    GRID,
+    GRIP_FORCE,
+    MORE_STREAMS,
+    PAD,
+    SETPOINT,
+    SOURCE,
+    SOURCES,
+    STATE,
+    TAU_EXT,
+    TIMES,
+    WRENCH_EXT,
+    CameraSetup,
+    Column,
+)
 
 if TYPE_CHECKING:
     from ..camera import Camera
@@ -280,6 +294,7 @@ class CameraBuffer:
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 _STAMP = ("t", "t_device", "seq")
 _UNKNOWN = [math.nan] * 7
 _NO_PAD = PadState(Stamp(math.nan, math.nan, 0))
@@ -314,10 +329,16 @@ def movable_objects(rig: Rig) -> tuple[str, ...]:
 class RowSampler:
     """Makes the rows of a rig; :attr:`columns` describes their numbers, in order.
 
-    With several arms, a column holds the joints of one after the other, and their names begin with the arm's.
+    With several arms, a column holds the joints of one after the other, and their names begin with the arm's. A dataset
+    that is continued gets no forces and no controls of pads that its first episodes do not have.
+
+    Args:
+        rig: An open rig.
+        cameras: Cameras that are recorded.
+        known: Names of the numbers of each column of the dataset; None for a new one.
     """
 
-    def __init__(self, rig: Rig, cameras: Iterable[str]) -> None:
+    def __init__(self, rig: Rig, cameras: Iterable[str], known: Mapping[str, Sequence[str]] | None = None) -> None:
         self._rig = rig
         self.source: Callable[[], str] = str
         """Returns who drives: one of :data:`~hal.recording.layout.SOURCES`."""
@@ -329,7 +350,9 @@ class RowSampler:
         self._parts: dict[str, tuple[str, list[str]]] = {}
         several = len(rig.robots) > 1
         self._add(GRID, ["t"], "float64")
-        self._efforts = [robot for robot in rig.robots.values() if robot.state().tau is not None]
+        states = {robot: robot.state() for robot in rig.robots.values()}
+        self._efforts = [robot for robot, state in states.items() if state.tau is not None]
+        self._external = any(s.tau_ext is not None for s in states.values()) or TAU_EXT in (known or {})
         for robot in rig.robots.values():
             self._add_robot(robot, f"{robot.name}." if several else "")
         for name in self._pads:
@@ -345,10 +368,27 @@ class RowSampler:
         if self._objects:
             self._add(f"{TIMES}objects", ["t"], "float64")
         self._add(SOURCE, ["source"], "int64")
+        self._pad_places: list[int] | None = None
+        """Places of those numbers of the pads that the dataset has; None for all."""
+        self.left_out = self._fit(known) if known is not None else []
+        """Columns, and numbers of columns, that the dataset does not have."""
         self.columns = tuple(Column(key, dtype, tuple(names)) for key, (dtype, names) in self._parts.items())
         """Key, type and names of the numbers in a row, in order."""
         self.width = sum(len(column.names) for column in self.columns)
         """Numbers in a row."""
+
+    def _fit(self, known: Mapping[str, Sequence[str]]) -> list[str]:
+        """Leave out what the dataset does not have; return the names."""
+        left = [key for key in (GRIP_FORCE, TAU_EXT, WRENCH_EXT) if key in self._parts and key not in known]
+        for key in left:
+            del self._parts[key]
+        dtype, names = self._parts.get(PAD, ("", []))
+        there = list(known.get(PAD, ()))
+        if there and set(there) < set(names):
+            self._pad_places = [names.index(name) for name in there]
+            self._parts[PAD] = dtype, there
+            left += [f"{PAD}: {name}" for name in names if name not in there]
+        return left
 
     def mark_arms(self, recorded: bool) -> None:
         """Note in each arm whether an episode is recorded."""
@@ -377,6 +417,9 @@ class RowSampler:
         self._add("observation.twist", [lead + name for name in _TWIST])
         self._add("rig.status", [lead + name for name in ("status", "trip", "limited")], "int64")
         self._add(f"{TIMES}robot.{robot.name}", _STAMP, "float64")
+        if self._external:
+            self._add(TAU_EXT, joints)
+            self._add(WRENCH_EXT, [lead + name for name in _WRENCH])
         if finger:
             self._add(GRIP_FORCE, finger)
             self._add(f"{TIMES}gripper.{robot.name}", _STAMP, "float64")
@@ -413,7 +456,8 @@ class RowSampler:
         found: dict[str, list[float]] = {key: [] for key in self._parts}
 
         def put(key: str, values: Iterable[float]) -> None:
-            found[key].extend(values)
+            if key in found:
+                found[key].extend(values)
 
         put(GRID, [t])
         for robot in self._rig.robots.values():
@@ -430,6 +474,8 @@ class RowSampler:
         if self._objects:
             put(f"{TIMES}objects", [snapshot.t_objects])
         put(SOURCE, [snapshot.source])
+        if self._pad_places is not None:
+            found[PAD] = [found[PAD][k] for k in self._pad_places]
         return [value for values in found.values() for value in values]
 
     def _put_robot(self, put: _Put, robot: Robot, state: RobotState) -> None:
@@ -445,13 +491,18 @@ class RowSampler:
         put("observation.twist", state.tcp_twist.tolist())
         put("rig.status", [float(state.status), float(state.trip), float(state.limited)])
         put(f"{TIMES}robot.{robot.name}", _stamp(state.stamp))
+        put(TAU_EXT, [math.nan] * robot.n if state.tau_ext is None else state.tau_ext.tolist())
+        put(WRENCH_EXT, [math.nan] * 6 if state.wrench_ext is None else state.wrench_ext.tolist())
         for grip in grips:
             put(GRIP_FORCE, [grip.force_target])
             put(f"{TIMES}gripper.{robot.name}", _stamp(grip.stamp))
 
 
 def select_devices(
-    rig: Rig, cameras: Collection[str] | None, streams: Collection[str]
+    rig: Rig,
+    cameras: Collection[str] | None,
+    streams: Collection[str],
+    known: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[RowSampler, list[CameraBuffer], list[str]]:
     """Return what is recorded of a rig.
 
@@ -459,6 +510,7 @@ def select_devices(
         rig: An open rig.
         cameras: Names of the cameras; None for all.
         streams: Streams to record of the cameras that have them.
+        known: Names of the numbers of each column of the dataset that is continued; None for a new one.
 
     Returns:
         The sampler of all arms and pads, a buffer per camera, and notes for the operator.
@@ -469,8 +521,8 @@ def select_devices(
         ConnectionLost: A device is lost.
     """
     if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
-        known = ", ".join(("color", "depth", *MORE_STREAMS))
-        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}", code="unknown_stream")
+        there = ", ".join(("color", "depth", *MORE_STREAMS))
+        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {there}", code="unknown_stream")
     if not rig.robots:
         raise CommandError("this rig has no arm to record", code="no_arm")
     names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
@@ -494,7 +546,9 @@ def select_devices(
         file_names = [name for each in files for name in each]
         if double := [name for name in file_names if file_names.count(name) > 1]:
             raise CommandError(f"two streams would be called {double[0]}: rename a camera", code="duplicate_name")
-    sampler = RowSampler(rig, [buffer.camera.name for buffer in buffers])
+    sampler = RowSampler(rig, [buffer.camera.name for buffer in buffers], known)
+    if sampler.left_out:
+        notes.append(f"not recorded, for the dataset does not have them: {', '.join(sampler.left_out)}")
     for buffer in buffers:
         seq = sampler.place_of(f"{TIMES}camera.{buffer.camera.name}") + 2
         buffer.setup = buffer.setup._replace(seq=seq)

@@ -6,11 +6,13 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 from recording_kit import check_layout, mock_rig
 
 import hal
 from hal.recording import Dataset, Recorder
 from hal.recording.sampling import RowSampler
+from hal.types import BUTTONS
 
 TWO = {
     "robots": {
@@ -45,6 +47,34 @@ def test_every_column_is_in_the_documentation() -> None:
         columns = RowSampler(rig, rig.cameras).columns
     missing = [one.key for one in columns if not {one.key, re.sub(r"\.\w+$", ".NAME", one.key)} & keys]
     assert not missing
+
+
+def test_a_dataset_of_earlier_columns_takes_more_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the gripper's force, and from a time when pads had a button less."""
+
+    def record() -> list[str]:
+        with mock_rig() as rig, Recorder(rig, tmp_path / "out") as recorder:
+            recorder.start()
+            rig.clock.sleep(0.5)
+            recorder.save(wait=True)
+            return recorder.notes
+
+    with monkeypatch.context() as earlier:
+        earlier.setattr("hal.recording.sampling.BUTTONS", BUTTONS[:-1])
+        earlier.setattr(RowSampler, "_fit", lambda sampler, known: [], raising=True)
+        build = RowSampler._add
+        keep = lambda sampler, key, *rest: None if key == "rig.setpoint_force" else build(sampler, key, *rest)  # noqa: E731
+        earlier.setattr(RowSampler, "_add", keep)
+        record()
+    notes = record()
+    info = check_layout(tmp_path / "out")
+    assert info["total_episodes"] == 2
+    assert "rig.setpoint_force" not in info["features"]
+    assert any("rig.setpoint_force" in note and f"button_{BUTTONS[-1]}" in note for note in notes)
+    first, second = Dataset(tmp_path / "out").episodes
+    assert first.columns["rig.pad"].shape[1] == second.columns["rig.pad"].shape[1]
+    pressed = second.columns["rig.pad"][:, info["features"]["rig.pad"]["names"].index("connected")]
+    assert pressed.all(), "each number is under its own name"
 
 
 def test_an_object_that_is_taken_away_is_not_known_any_more(tmp_path: Path) -> None:
