@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from numpy.typing import NDArray
 
 from ._moved import names_of
+from .clock import describe_load
 from .errors import ConnectionLost, HalError, StaleStateError
 from .geometry import Pose
 from .histogram import Histogram
@@ -126,7 +127,7 @@ class Camera:
             if self._error is not None:
                 raise self._error
             if not fresh:
-                raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
+                raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s{describe_load()}")
             return self._return_newest()
 
     def latest(self, max_age: float = 0.2) -> Frame:
@@ -148,7 +149,7 @@ class Camera:
                 raise StaleStateError(f"camera {self.name} has taken no frame yet", code="no_frame")
             age = self.clock.now() - self._newest.stamp.t
             if age > max_age:
-                raise StaleStateError(f"the newest frame of camera {self.name} is {age:.3f} s old")
+                raise StaleStateError(f"the newest frame of camera {self.name} is {age:.3f} s old{describe_load()}")
             return self._return_newest()
 
     def on_frame(self, callback: Callable[[Frame], None]) -> Callable[[], None]:
@@ -233,7 +234,7 @@ class Camera:
                     rest = deadline - time.monotonic()
                     raw = self._driver.grab(max(0.0, rest))
                     if raw is None or (after is not None and raw.t < after and rest < 0.0):
-                        raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
+                        raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s{describe_load()}")
                     if raw is self._raw and self._newest is not None:
                         frame = self._newest  # nothing has changed since it was rendered
                     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 from .arguments import number
 
-__all__ = ["Clock", "LockStepClock", "RealClock", "Tick"]
+__all__ = ["Clock", "LockStepClock", "RealClock", "Tick", "describe_load"]
 
 _ROUNDING = 1e-9
 _LONGEST = 1e9
@@ -161,3 +162,9 @@ class _Stop:
         """Call the function; calls that are overdue are skipped."""
         self._number = 1 + max(self._number, int((now - self._start) / self._period + _ROUNDING))
         self._call()
+
+
+def describe_load() -> str:
+    """Return words for a message if more programs want to run than there are processors; else nothing."""
+    load, count = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0, os.cpu_count() or 1
+    return f" (this computer is busy: a load of {load:.1f} on {count} processors)" if load > count else ""

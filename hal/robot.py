@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ._moved import names_of
 from .arguments import number, vector
+from .clock import describe_load
 from .control import Control, check_deadman
 from .errors import CommandError, ConnectionLost, NotSupported, StaleStateError
 from .geometry import Pose, frozen, tcp_pose
@@ -187,7 +188,8 @@ class Robot:
             raise ConnectionLost(f"{self.name} does not answer{reason} (its last state is {age:.3f} s old)")
         if not age <= max_age:
             number("max_age", max_age, "s")
-            raise StaleStateError(f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s")
+            text = f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s"
+            raise StaleStateError(text + describe_load())
         return state
 
     def state_at(self, t: float) -> RobotState:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from hal import registry
+from hal.clock import describe_load
 from hal.errors import ConnectionLost, ControlTaken, Fault
 from hal.host.process import Channel, Child, SharedMemory
 from hal.preflight import CheckResult
@@ -128,14 +129,14 @@ def _check_robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[CheckResult
     host = settings.host
     report = _query_robot(host, settings.arm)
     if report is None:
-        found = f"{host}:{ARM_PORT} is open, but does not answer: another program may hold the arm"
+        found = f"{host}:{ARM_PORT} is open, but does not answer: another program may hold the arm{describe_load()}"
         yield CheckResult("robot", "fail", found, _IN_USE)
     elif "missing" in report:
         yield _missing(report["missing"])
     elif "fault" in report:
         fault = Fault(*report["fault"])
         if fault.code == "closed":
-            found = f"{host}:{ARM_PORT} closes the connection: another program may hold the arm"
+            found = f"{host}:{ARM_PORT} closes the connection: another program may hold the arm{describe_load()}"
             yield CheckResult("robot", "fail", found, _IN_USE)
         else:
             yield _failed("robot", fault)

@@ -15,6 +15,7 @@ __all__ = [
     "MAX_BYTES",
     "MESSAGES_LATE",
     "PAGE_CLOSED",
+    "PAGE_GONE",
     "PAGE_SILENT",
     "RELEASE_MISSED",
     "ControlRequest",
@@ -36,6 +37,7 @@ __all__ = [
 MAX_BYTES = 4096
 """Longest message of a page."""
 PAGE_CLOSED = "the page in control was closed"
+PAGE_GONE = "the page in control is no longer connected"
 RELEASE_MISSED = "a release of the controls may have been missed"
 CLOCK_AHEAD = "The page's clock runs ahead"
 MESSAGES_LATE = "The page's messages came late"

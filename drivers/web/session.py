@@ -19,7 +19,7 @@ from hal.servo.watchdog import PAD_SILENCE
 from .messages import (
     CLOCK_AHEAD,
     MESSAGES_LATE,
-    PAGE_CLOSED,
+    PAGE_GONE,
     PAGE_SILENT,
     ControlRequest,
     MalformedMessage,
@@ -49,7 +49,10 @@ _MAX_REQUESTS = 16
 """Requests of pages that may wait for the app."""
 _MAX_NOTES = 256
 """Messages that must not be left out and may wait for one page."""
-_TOO_SLOW = f"{{}}: the connection is too slow to drive (a round trip may take {1e3 * PAD_SILENCE:g} ms at most)"
+_TOO_SLOW = (
+    f"{{}}: the network is too slow, or a computer too busy, to drive "
+    f"(a round trip may take {1e3 * PAD_SILENCE:g} ms at most)"
+)
 _COMPLAINT_PERIOD = 2.0
 """Shortest time between two complaints to one page about that, in s."""
 _KEPT_LINES = 50
@@ -351,7 +354,7 @@ class WebSession:
     def close_page(self, page: WebPage) -> None:
         """Remove a page and end its control. Idempotent."""
         if self.pages.pop(page.name, None) is not None:
-            self._apply(self._lease.release(page.name, self._clock(), PAGE_CLOSED))
+            self._apply(self._lease.release(page.name, self._clock(), PAGE_GONE))
 
     # Messages of pages.
 

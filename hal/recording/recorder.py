@@ -232,7 +232,7 @@ class Recorder:
                 metadata cannot be stored (``bad_metadata``), the disk is full (``disk_full``) or the folder cannot be
                 used.
             DatasetError: The dataset in the folder is damaged.
-            StaleStateError: A camera has no current picture.
+            StaleStateError: A camera has no picture for 2 s.
             ConnectionLost: A camera, or the writer's process, is lost.
         """
         given = caller_metadata(self.task, seed, info)

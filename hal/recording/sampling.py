@@ -191,6 +191,8 @@ _KEEP = 0.5
 """Span of pictures that are kept for rows that are made late, s."""
 _SILENT = 1.0
 """Age of the newest picture above which a camera counts as lost, s."""
+_FIRST_PICTURE = 2.0
+"""Longest time that the start of an episode waits for a picture of a late camera, s."""
 
 
 class CameraBuffer:
@@ -224,13 +226,21 @@ class CameraBuffer:
         )
 
     def start(self) -> None:
-        """Start an episode. Raises StaleStateError or ConnectionLost if the camera has no picture now."""
+        """Start an episode. Waits for a late camera.
+
+        Raises:
+            StaleStateError: It has no picture for 2 s.
+            ConnectionLost: It does not answer.
+        """
         self._lost, self.repeated, self._last_seq = None, 0, -1
         with self._lock:
             self._frames.clear()
         if not self._lock_step:  # before the first picture, so that neither a frame nor a loss is missed
             self._detach = [self.camera.on_frame(self._add_frame), self.camera.on_connection(self._mark_lost)]
-        first = self.camera.latest(max_age=_SILENT)
+        try:
+            first = self.camera.latest(max_age=_SILENT)
+        except StaleStateError:
+            first = self.camera.read(timeout=_FIRST_PICTURE, after=self.camera.clock.now() - _SILENT)
         with self._lock:
             if not self._frames or first.stamp.seq < self._frames[0].stamp.seq:
                 self._frames.appendleft(first)

@@ -82,6 +82,16 @@ def test_a_frozen_browser(bench: Bench, moving: Browser) -> None:
     goes_on_after_release_and_press(bench, moving)
 
 
+def test_a_page_that_hangs_names_the_busy_computer(bench: Bench, moving: Browser) -> None:
+    for count in (1, 2):
+        moving.run("const t = performance.now(); while (performance.now() - t < 600);")
+        wait_for(lambda: stopped(bench), "the arm to be stopped")
+        wait_for(lambda: "too busy (the page hung for 0.6 s)" in moving.text("#trip-text"), "the page to say why")
+        if count == 1:
+            assert "times" not in moving.text("#log")
+            goes_on_after_release_and_press(bench, moving)
+
+
 def test_a_reloaded_page(bench: Bench, moving: Browser) -> None:
     moving.chrome.refresh()
     braking_after(bench, time.monotonic())

@@ -39,7 +39,7 @@ async def test_malformed_messages_are_tolerated_up_to_a_limit(app: App) -> None:
         assert (await app.pad())["connected"]
         await page.ws.send_str("nonsense")
         assert await page.closed() == 4400
-        assert (await app.pad())["why"] == "the page in control was closed"
+        assert (await app.pad())["why"] == "the page in control is no longer connected"
     async with Page(app) as page:
         await page.next("hello")
 
@@ -87,7 +87,7 @@ async def test_the_lease_between_two_pages(app: App) -> None:
             await first.ws.send_json(first.pad([1.0] * 8))
             await second.drive()
             assert (await app.pad())["from"] == "page 2"
-        assert (await app.pad())["why"] == "the page in control was closed"
+        assert (await app.pad())["why"] == "the page in control is no longer connected"
         assert await app.next() == {"driver": None}
         assert (await first.next("lease"))["driver"] is None
 
@@ -106,7 +106,9 @@ async def test_a_page_that_leaves_loses_the_pad_at_once(app: App, how: str) -> N
             page.ws._response.connection.transport.abort()
         pad = await app.pad()
         assert not pad["connected"]
-        assert pad["why"] == ("the page was hidden" if how == "hidden" else "the page in control was closed")
+        assert pad["why"] == (
+            "the page was hidden" if how == "hidden" else "the page in control is no longer connected"
+        )
 
 
 async def test_a_silent_page_loses_the_pad(app: App) -> None:

@@ -17,7 +17,7 @@ from recording_kit import check_layout, mock_rig
 from waiting import wait_until
 
 import hal
-from hal.errors import CommandError, ConnectionLost
+from hal.errors import CommandError, ConnectionLost, StaleStateError
 from hal.recording import Dataset, Recorder, recover
 from hal.rig import Rig
 from hal.types import Frame, RobotStatus, Trip
@@ -213,6 +213,29 @@ def test_a_camera_that_falls_silent(rig: Rig, out: Path) -> None:
         recorder.save(wait=True)
     usable(out, 15)
     assert Dataset(out).episodes[0].info["repeated"]["scene"] > 10, "rows that show an old picture are counted"
+
+
+def test_a_late_camera_is_waited_for(rig: Rig, out: Path) -> None:
+    camera = rig.cameras["scene"]
+
+    def silent() -> bool:
+        try:
+            camera.latest(max_age=1.0)
+        except StaleStateError:
+            return True
+        return False
+
+    with Recorder(rig, out) as recorder:
+        camera.inject(freeze=True)
+        wait_until(silent)
+        threading.Timer(0.3, lambda: camera.inject(freeze=False)).start()
+        begin(recorder)
+        recorder.save(wait=True)
+        camera.inject(freeze=True)
+        wait_until(silent)
+        with pytest.raises(StaleStateError):
+            recorder.start()
+    usable(out, 15)
 
 
 def test_a_writer_that_is_killed(rig: Rig, out: Path) -> None:

@@ -187,7 +187,10 @@ releases.lost = (why) => {
 };
 
 heartbeat.before.push((dt) => releases.check(dt), (dt) => keyboard.moveGrip(dt), () => gamepad.read());
-heartbeat.stalled = (ms) => log.add(`this page hung for ${Math.round(ms)} ms`);
+heartbeat.stalled = (ms) => {
+  log.add("this computer is too busy: the page hung");
+  status.noteHang(ms);
+};
 pad.changed.push(() => advise());
 
 // A finger on STOP counts at once; a click without a pointer comes from the keyboard or an assistive tool.

@@ -5,6 +5,7 @@ import { PAD_SILENCE } from "./keys.js";
 
 const OLD = 500; // ms without a state until the page says so
 const STOPPING = 1000; // ms within which a state shows the stop after the message that STOP was pressed
+const HANG_SHOWN = 2000; // ms between the end of a hang of this page and the state that shows the stop for it
 const MOVING = 0.005; // rad/s; slower joints are at rest
 
 /** Status of a robot -> label. @type {Record<string, string>} */
@@ -58,6 +59,14 @@ export class Status {
   /** Who pressed STOP last, and when; "" if unknown. */
   #stopped = "";
   #stoppedAt = -Infinity; // ms
+  /** How long this page hung last, and when it woke up, ms. */
+  #hang = { length: 0, at: -Infinity };
+  #trippedAt = -Infinity; // ms
+
+  /** Note that this page hung. @param {number} ms */
+  noteHang(ms) {
+    this.#hang = { length: ms, at: performance.now() };
+  }
 
   /** Note a message of the program. @param {any} message @param {Date} at */
   addMessage({ text, loss, stop }, at) {
@@ -121,6 +130,7 @@ export class Status {
     const trip = stopped === undefined ? "none" : (robots[stopped].trip ?? "lost");
     const isNew = trip !== "none" && this.trip === "none";
     this.trip = trip;
+    if (isNew) this.#trippedAt = performance.now();
     if (trip === "none" && performance.now() - this.#stoppedAt > STOPPING) this.#stopped = "";
     if (stopped !== undefined) {
       setText(byId("trip-text"), called(stopped) + this.#why(robots[stopped]));
@@ -135,6 +145,10 @@ export class Status {
   #why(robot) {
     if (robot.lost) return `No state of the arm: ${robot.lost}`;
     if (robot.trip === "stop") return `Stopped by STOP${this.#stopped && ` (${this.#stopped})`}`;
+    const gone = robot.trip === "deadman_lost" || robot.trip === "deadman_silent";
+    if (gone && Math.abs(this.#hang.at - this.#trippedAt) < HANG_SHOWN) {
+      return `Stopped: this computer is too busy (the page hung for ${(this.#hang.length / 1000).toFixed(1)} s)`;
+    }
     if (robot.trip === "deadman_lost" && this.#loss.text) return sentence(this.#loss.text);
     const page = this.lease.rig?.drivable ? PAGE_TRIPS[robot.trip] : "";
     return `Stopped: ${page || robot.trip_text || robot.trip}`;
@@ -306,10 +320,17 @@ export class Log {
   /** Add a line. @param {string} text @param {number | null} [t] on the app's clock, s; null: now @returns {Date} its time */
   add(text, t = null) {
     const at = t === null || this.shift === null ? new Date() : new Date(1000 * (t + this.shift));
+    const last = this.list.lastElementChild;
+    if (last instanceof HTMLElement && last.dataset.text === text) {
+      last.dataset.count = String(Number(last.dataset.count) + 1);
+      setText(/** @type {Element} */ (last.lastElementChild), `${text} (${last.dataset.count} times)`);
+      return at;
+    }
     const line = make("li");
     const time = make("time", "", at.toTimeString().slice(0, 8));
     time.dateTime = at.toISOString();
     line.append(time, make("span", "", text));
+    Object.assign(line.dataset, { text, count: 1 });
     const atEnd = this.list.scrollHeight - this.list.scrollTop - this.list.clientHeight < 40;
     this.list.append(line);
     while (this.list.childElementCount > MAX_LINES) this.list.firstElementChild.remove();

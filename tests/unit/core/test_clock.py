@@ -1,12 +1,13 @@
 """The clock of a lock-step rig, and the rate of a loop on any clock."""
 
 import itertools
+import os
 
 import pytest
 
 import hal
 from hal import CommandError
-from hal.clock import Clock, LockStepClock, RealClock
+from hal.clock import Clock, LockStepClock, RealClock, describe_load
 
 
 class Simulated:
@@ -145,3 +146,9 @@ def test_short_sleeps_of_a_rig_add_up() -> None:
         for _ in range(100):
             rig.clock.sleep(0.001)
         assert rig.clock.now() > before + 0.09
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.9, False), (2.0, True)])
+def test_a_message_names_a_busy_computer(monkeypatch: pytest.MonkeyPatch, share: float, told: bool) -> None:
+    monkeypatch.setattr("os.getloadavg", lambda: (share * (os.cpu_count() or 1), 0.0, 0.0))
+    assert ("busy" in describe_load()) is told

@@ -193,7 +193,9 @@ def test_no_page_drives_after_the_driver_released_or_left(room: Room, how: str) 
         room.session.close_page(driver)
     gone, free = room.app.news()
     assert not gone["pad"]["connected"]
-    assert gone["pad"]["why"] == ("page 1 released control" if how == "let go" else "the page in control was closed")
+    assert gone["pad"]["why"] == (
+        "page 1 released control" if how == "let go" else "the page in control is no longer connected"
+    )
     assert free == {"driver": None}
     (lease,) = inbox(other)
     assert (lease["driver"], lease["you"]) == (None, False)
