@@ -60,8 +60,16 @@ def check_report_and_columns(folder: Path) -> None:
     assert (found["trips"], found["faults"], found["ended"], found["discarded"]) == ([], [], "", 0)
     assert [one["dropped"] for one in found["episodes"]] == [0, 0]
     documented = {f"observation.{name}" for name in ("state", "velocity", "effort", "tcp", "twist")}
-    extra = {"setpoint", "setpoint_velocity", "tcp_set", "status", "pad", "object.cube", "object.duck"}
-    extra |= {"time.grid", "time.objects", "time.robot.panda", "time.gripper.panda", "time.pad.pad"}
+    extra = {"setpoint", "setpoint_velocity", "setpoint_force", "tcp_set", "status", "pad"}
+    extra |= {
+        "object.cube",
+        "object.duck",
+        "time.grid",
+        "time.objects",
+        "time.robot.panda",
+        "time.gripper.panda",
+        "time.pad.pad",
+    }
     for camera in ("scene", "wrist"):
         documented |= {f"observation.images.{camera}"}
         extra |= {f"camera_pose.{camera}", f"time.camera.{camera}"}
