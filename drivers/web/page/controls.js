@@ -300,9 +300,9 @@ export class Controls {
     setAttribute(this.hold, "aria-pressed", String(held));
     setText(/** @type {Element} */ (this.hold.querySelector("b")), !held ? "HOLD TO MOVE" : this.mustRelease ? "RELEASE" : "HELD");
     setText(byId("hold-keys"), !held ? this.holdKeys() : this.mustRelease ? "" : "Release to stop");
-    setAttribute(this.home, "aria-disabled", String(!held));
+    setAttribute(this.home, "aria-disabled", String(!held || this.mustRelease));
     const homing = this.pad.home !== null && (mask & BIT[this.pad.home]) !== 0;
     setData(this.home, "pressed", homing ? "" : null);
-    setText(byId("home-note"), held ? "hold until it arrives" : "hold to move first");
+    setText(byId("home-note"), held && !this.mustRelease ? "hold until it arrives" : "hold to move first");
   }
 }
