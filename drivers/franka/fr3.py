@@ -14,12 +14,8 @@ from .link import ArmLink, ArmSample, Floats, StreamKind
 
 __all__ = ["Fr3Link"]
 
-_NOISE = 2e-6
-"""Noise of the reported positions, rad: within it, the servo's own set-point is more exact than the report.
-
-They are float32, whose step is 2.4e-7 near pi. A first step of this size from rest has a jerk of 2 * 2e-6 / (1 ms)^3 =
-4,000 rad/s3; the robot allows 5,000.
-"""
+_NOISE = 4e-6
+"""Noise of the reported positions, rad: within it, the servo's own set-point is more exact than the report."""
 
 
 class Fr3Link(ArmLink):
