@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import ceil, dist, hypot, inf, sqrt
-from operator import sub
+from operator import mul, sub
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +105,10 @@ class CollisionGuard:
         """
         smoother, around = self._smoother, self._around
         limits = zip(dq, smoother.acceleration, smoother.jerk, strict=True)
-        near = around.near(smoother.q, [self._braking_way(abs(v), A, J) for v, A, J in limits])
+        ways = [self._braking_way(abs(v), A, J) for v, A, J in limits]
+        if around.stays_clear(smoother.q, ways):
+            return dq
+        near = around.near(smoother.q, ways)
         if not near:
             return dq
         before = around.bounds.distances[near]
@@ -321,6 +324,10 @@ class _Surroundings:
             self._later, self._turned = tuple(q), turned
         self.last, self.left = q, left
         return True
+
+    def stays_clear(self, q: Floats, ways: Floats) -> bool:
+        """Return whether no pair can get near on these ways of the joints (n,), rad, from ``q`` (n,)."""
+        return self.is_clear(q, sum(map(mul, self._weights, ways)))
 
     def near(self, q: Floats, ways: Floats) -> list[int]:
         """Return the pairs that may get near while the joints move this far (n,), rad, from ``q``."""

@@ -92,6 +92,14 @@ class TcpReference:
         self._slowest = 0.0
         self._step = 0.0
         """Farthest that one tick can move the tcp and the end of its stop, together, m."""
+        still = [0.0] * smoother.n
+        self._proven: tuple[float, Floats, Floats, Floats, Floats] = (inf, still, still, still, still)
+        """Bound of the tcp's speed in the stop that was proven last, m/s; where that stop begins (joint positions,
+        speeds and accelerations), and the mean speeds of the step before it, each (n,)."""
+        self._ramps = still
+        """What a joint's acceleration changes of the speeds in its stop at most, rad/s for each rad/s2 (n,)."""
+        self._longest = 0.0
+        """Longest duration of a stop, s."""
         self._proof: Floats = ()
         """The set-point from which the next step was proven to be inside, with this margin, m."""
         self._margin = 0.0
@@ -108,6 +116,9 @@ class TcpReference:
         self._slowest = min(velocity)
         self._step = 0.0
         self._proof = ()
+        self._proven = inf, *self._proven[1:]
+        self._ramps = [2.0 * A / J for A, J in limits]
+        self._longest = 0.0
         # The way f(v, a) of a stop grows with the speed v and the acceleration a that it begins with, and is convex in
         # each, so f(v, a) <= f(v, 0) + (f(v, A) - f(v, 0)) a / A, where f(v, 0) <= f(u, 0) v / u for any u >= v, and
         # the difference grows with v. Here u lies a tick's acceleration beyond the session's speed, so that the bound
@@ -118,6 +129,7 @@ class TcpReference:
             per_v, per_a = reach * steady / u, reach * (worst - steady) / A
             self._stops.append((cap, per_v, per_a))
             self._fastest.append(u)
+            self._longest = max(self._longest, stop_phases(u, A, A, J)[3])
             self._step += reach * u * dt + per_v * A * dt + per_a * min(A, J * dt)
         self._per_speed = hypot(*[per_v for _, per_v, _ in self._stops])
         self._per_acceleration = hypot(*[per_a for _, _, per_a in self._stops])
@@ -207,14 +219,43 @@ class TcpReference:
             near = self._around(max(dist(dq, self._centre), dist(mean, self._centre)))
             if near + ramps + fastest * self._reach_length * dist(q, self._at) <= cap:
                 return True
+            if self._like_proven_stop(mean, fastest) <= cap:
+                return True
             self._put_centre(dq)
             if self._around(dist(mean, dq)) + ramps + fastest * self._moved() <= cap:
                 return True
         self._refresh()
-        return self._proves_slower_stop(cap)
+        bound = self._fastest_in_stop(cap)
+        if bound <= cap:
+            mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
+            self._proven = bound, smoother.q_next, dq, smoother.ddq_next, mean
+        return bound <= cap
 
-    def _proves_slower_stop(self, cap: float) -> bool:
-        """Return whether the tcp keeps below ``cap`` (m/s) in the proposed step and in the stop after it.
+    def _like_proven_stop(self, mean: Floats, fastest: float) -> float:
+        """Return a bound of the tcp's speed in the proposed step and its stop, m/s, from the stop that was proven last.
+
+        From the speed v and the acceleration a > 0 a stop is the stop from v + a^2 / (2 J) and no acceleration, entered
+        a / J later. Two stops without acceleration differ in speed at most by what they begin with, and at two times
+        by A for each second. So a joint's speeds in two stops never differ by more than |dv| + 2 A / J |da|.
+
+        Args:
+            mean: Mean joint speeds (n,) of the proposed step, rad/s.
+            fastest: Sum of the joints' speeds, which is never greater, rad/s.
+        """
+        smoother = self._smoother
+        bound, *proven = self._proven
+        off = in_step = moved = 0.0
+        for r, per_a, q, q0, v, v0, a, a0, m, m0 in zip(
+            self._reach, self._ramps, smoother.q_next, proven[0], smoother.dq_next, proven[1], smoother.ddq_next,
+            proven[2], mean, proven[3], strict=True,
+        ):  # fmt: skip
+            off += r * (abs(v - v0) + per_a * abs(a - a0))
+            in_step += r * abs(m - m0)
+            moved += r * abs(q - q0)
+        return bound + max(off, in_step) + fastest * (moved + smoother.dt * in_step + self._longest * off)
+
+    def _fastest_in_stop(self, cap: float) -> float:
+        """Return a bound of the tcp's speed in the proposed step and in the stop after it, m/s, exact enough for a cap.
 
         Between any two of the times below each joint's speed is a parabola, which lies in the triangle of its control
         points (both ends, and where their tangents meet). With the Jacobian of the reference the tcp's velocity is one,
@@ -255,8 +296,9 @@ class TcpReference:
 
         fastest = np.sqrt(np.square(control @ linear).sum(axis=2).max(axis=0))
         in_step = hypot(*(mean @ linear).tolist()) + float(reached[0]) * mean_total
-        if max(float((fastest + reached * total).max()), in_step) <= cap:
-            return True
+        bound = max(float((fastest + reached * total).max()), in_step)
+        if bound <= cap:
+            return bound
 
         if self._curvature is None:
             self._curvature = self._kinematics.curvature(self._jacobian).reshape(smoother.n, -1)
@@ -271,7 +313,7 @@ class TcpReference:
         left_out = 0.5 * reached * way.sum(axis=1) + self._bend * widths[:, 0] ** 2
         middle = linear + ((here - 0.5 * dt * mean) @ self._curvature).reshape(smoother.n, 3)
         in_step = hypot(*(mean @ middle).tolist()) + float(left_out[0]) * mean_total
-        return max(float((fastest + left_out * total).max()), in_step) <= cap
+        return max(float((fastest + left_out * total).max()), in_step)
 
     def surely_inside(self, margin: float) -> bool:
         """Return whether the tcp, stopped now, surely stays ``margin`` (m) off every face of the workspace."""
