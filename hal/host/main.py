@@ -306,7 +306,8 @@ class HostProcess:
                 return
         self._run_cycle()
         self._settle_up()
-        self._attend(0.0)
+        if self.pace.pausing or (cycle.ticks + 1) % self._state_every == 0:  # between two states
+            self._attend(0.0)
 
     def _run_cycle(self) -> None:
         self._alarm()
