@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=4.0, help="length of one round (%(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of each (%(default)s)")
     parser.add_argument("--alone", type=float, metavar="S", help="only print the steps/s of one environment")
-    parser.add_argument("--engine", choices=registry.ENGINES, default="auto", help="of the simulated world")
+    parser.add_argument("--engine", choices=("auto", *registry.ENGINES), default="auto", help="of the simulated world")
     args = parser.parse_args()
     if args.alone is not None:
         print(alone(args.engine, args.alone))

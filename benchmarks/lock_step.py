@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 import hal
+from hal.drivers.pybullet.loading import loadable_urdf
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
 POLICY_HZ = 20.0
@@ -134,7 +135,8 @@ def place_by_hand(p: Any, c: int, body: BodySpec) -> None:
 
 def load_by_hand(p: Any, c: int, arm: RobotSpec) -> tuple[int, list[int], list[int]]:
     """Load an arm at its start; return its number, its joints and its fingers."""
-    robot = p.loadURDF(arm.urdf, arm.base_position, arm.base_orientation, useFixedBase=True, physicsClientId=c)
+    with loadable_urdf(arm.urdf) as urdf:
+        robot = p.loadURDF(urdf, arm.base_position, arm.base_orientation, useFixedBase=True, physicsClientId=c)
     numbers = {
         p.getJointInfo(robot, k, physicsClientId=c)[1].decode(): k
         for k in range(p.getNumJoints(robot, physicsClientId=c))

@@ -241,8 +241,7 @@ def pack(dataset: str | Path) -> int:
     Returns:
         The number of episodes.
 
-    Raises:
-        As :func:`merge`.
+    Raises as :func:`merge`.
     """
     return merge([dataset], dataset)
 
