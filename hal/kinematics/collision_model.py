@@ -36,7 +36,8 @@ _SAMPLES = 300
 _MOSTLY = 0.25
 """Two links that touch in this share of them are left out: their shapes are too coarse to tell more."""
 _RESERVE = 0.05
-"""Pairs that may get too near before each joint has turned so far, rad, are looked at more often than the others."""
+"""Pairs that may get too near on thrice the way, or before each joint has turned so far, rad, are looked at more often
+than the others."""
 _RING = 16
 """Points on the outline of a circle."""
 _SHARE_AT_HOME = 0.5
@@ -183,7 +184,7 @@ class PairBounds:
         levers = self.model.levers
         needed = levers @ way + least
         bounds = self.distances - (levers * np.abs(self._at - q)).sum(axis=1)
-        listed = needed + _RESERVE * levers.sum(axis=1)
+        listed = needed + levers @ (2.0 * way + _RESERVE)
         self._compute(q, np.arange(self.model.count), bounds, listed)
         near = bounds < listed
         self._least, self._centre = least, q.copy()
