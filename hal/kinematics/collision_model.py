@@ -36,8 +36,9 @@ _SAMPLES = 300
 _MOSTLY = 0.25
 """Two links that touch in this share of them are left out: their shapes are too coarse to tell more."""
 _RESERVE = 0.05
-"""Pairs that may get too near on thrice the way, or before each joint has turned so far, rad, are looked at more often
-than the others."""
+"""Pairs that may get too near on thrice the way, and after each joint has turned so far, rad, count as close;"""
+_FRESH = 0.8
+"""the distances of those are computed again when less than this share of their room is left."""
 _RING = 16
 """Points on the outline of a circle."""
 _SHARE_AT_HOME = 0.5
@@ -137,8 +138,7 @@ class PairBounds:
     """Distances of all pairs of a model, computed only where a bound from an earlier position does not suffice.
 
     No distance changes by more than the levers times the way of the joints. So a distance that was computed once is a
-    bound for every position around, and only pairs that may be too near are computed again. All pairs are looked at
-    only after the joints have turned a little; in between those few that are near.
+    bound for every position around, and only pairs that may be too near are computed again.
     """
 
     def __init__(self, model: CollisionModel) -> None:
@@ -150,15 +150,8 @@ class PairBounds:
         """(n,), 1/rad: no pair gets under the ``least`` of the last call of :meth:`near` as long as the turns of the
         joints since the positions of that call, times these, make less than 1 together."""
         self._at: Array = np.zeros((model.count, model.n))
-        self._least: Array | None = None
-        self._centre: Array = np.zeros(model.n)
-        """Where all pairs were looked at last, rad, and the weights there of those that are not in the list of near
-        ones."""
-        self._rest = self.weights
-        self._few: NDArray[np.intp] = np.empty(0, np.intp)
-        """The near pairs, and their rows of the arrays above."""
-        self._few_levers = model.levers
-        self._few_least: Array = model.margins
+        """Joint positions (pairs, n) at which each distance was computed, rad."""
+        self._reserve: Array = _RESERVE * model.levers.sum(axis=1)
 
     def near(self, q: Array, way: Array, least: Array) -> list[int]:
         """Return the pairs that may get under ``least`` (pairs,), m, on a way that begins at ``q`` (n,), rad.
@@ -166,49 +159,36 @@ class PairBounds:
         Args:
             q: Joint positions (n,), rad.
             way: How far each joint may move from there at most (n,), rad.
-            least: Distance of each pair, m; not to be changed between calls.
+            least: Distance of each pair, m.
         """
-        if least is not self._least:
-            return self._look_at_all(q, way, least)
-        left = 1.0 - float(self._rest.dot(np.abs(q - self._centre)))
-        if not left > 0.5 + float(self._rest.dot(way)):
-            return self._look_at_all(q, way, least)
-        few, levers = self._few, self._few_levers
-        bounds = self.distances[few] - (levers * np.abs(self._at[few] - q)).sum(axis=1)
-        needed = levers @ way + self._few_least
-        self._compute(q, few, bounds, np.maximum(needed, 0.5 * (self.distances[few] + self._few_least)))
-        self.weights = np.maximum(self._rest / left, _weights(levers, bounds - self._few_least))
-        return [int(k) for k in few[bounds < needed]]
-
-    def _look_at_all(self, q: Array, way: Array, least: Array) -> list[int]:
         levers = self.model.levers
-        needed = levers @ way + least
-        bounds = self.distances - (levers * np.abs(self._at - q)).sum(axis=1)
-        listed = needed + levers @ (2.0 * way + _RESERVE)
-        self._compute(q, np.arange(self.model.count), bounds, listed)
-        near = bounds < listed
-        self._least, self._centre = least, q.copy()
-        self._few = np.flatnonzero(near)
-        self._few_levers, self._few_least = levers[near], least[near]
-        self._rest = _weights(levers[~near], (bounds - least)[~near])
-        self.weights = np.maximum(self._rest, _weights(self._few_levers, (bounds - least)[near]))
-        return [int(k) for k in np.flatnonzero(bounds < needed)]
+        bounds = self.distances - np.einsum("kj,kj->k", levers, np.abs(self._at - q))
+        reach = levers @ way
+        needed = reach + least
+        # Pairs within thrice the way are computed before they are needed, or the weights would soon be of no use.
+        fresh = least + _FRESH * (self.distances - least)
+        low = np.flatnonzero(bounds < np.maximum(needed, np.minimum(needed + 2.0 * reach + self._reserve, fresh)))
+        if len(low):
+            self._compute(q, low, bounds)
+        rooms = bounds - least
+        if rooms.min(initial=np.inf) > 0.0:
+            self.weights = (levers / rooms[:, np.newaxis]).max(axis=0, initial=0.0)
+        else:
+            self.weights = np.full(self.model.n, np.inf)
+        near: list[int] = np.flatnonzero(bounds < needed).tolist()
+        return near
 
-    def _compute(self, q: Array, pairs: NDArray[np.intp], bounds: Array, needed: Array) -> None:
-        """Compute the pairs whose bounds (m, changed in place) are below what is needed."""
-        low = np.flatnonzero(bounds < needed)
-        if not len(low):
-            return
+    def _compute(self, q: Array, pairs: NDArray[np.intp], bounds: Array) -> None:
+        """Compute the distances of ``pairs`` at ``q`` (n,), rad, and put them into ``bounds`` (all pairs,), m."""
         model = self.model
         model.place(q)
-        if 2 * len(low) > model.count:
+        if 2 * len(pairs) > model.count:
             self.distances = model.distances()
             self._at[:] = q
-            bounds[:] = self.distances[pairs]
+            bounds[:] = self.distances
             return
-        for i in low:
-            k = int(pairs[i])
-            self.distances[k] = bounds[i] = model.distance(k)
+        for k in pairs.tolist():
+            self.distances[k] = bounds[k] = model.distance(k)
             self._at[k] = q
 
     def nearest(self, q: Array) -> tuple[int, float]:
@@ -220,19 +200,6 @@ class PairBounds:
         self._at[:] = q
         k = int(np.argmin(self.distances))
         return k, float(self.distances[k])
-
-
-def _weights(levers: Array, rooms: Array) -> Array:
-    """Return the share (n,), 1/rad, of the room of any pair that a turn of each joint takes at most.
-
-    Args:
-        levers: (pairs, n), m/rad.
-        rooms: How much nearer the shapes of each pair may come (pairs,), m.
-    """
-    if rooms.min(initial=np.inf) <= 0.0:
-        return np.full(levers.shape[1], np.inf)
-    weights: Array = (levers / rooms[:, np.newaxis]).max(axis=0, initial=0.0)
-    return weights
 
 
 # The scene: built once for each set of arms and boxes.

@@ -154,7 +154,7 @@ class CollisionGuard:
         ways = [
             max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) for v, a, (A, J) in zip(dq, ddq, limits, strict=True)
         ]
-        near = around.near(q, ways)
+        near = [] if around.stays_clear(q, ways) else around.near(q, ways)
         if not near:
             self._floors.clear()
             return True
