@@ -14,9 +14,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ._moved import install as _install_aliases
-from ._moved import names_of as _names_of
-
 if TYPE_CHECKING:
     from . import gym as gym
     from .camera import Camera
@@ -197,8 +194,6 @@ _MODULES = {
         "Trip",
     ),
 }
-_install_aliases()
-_find_moved = _names_of(__name__)
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 
@@ -214,7 +209,7 @@ def __getattr__(name: str) -> Any:
     elif name in _HOME:
         value = getattr(import_module(f".{_HOME[name]}", __name__), name)
     else:
-        return _find_moved(name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value
     return value
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from ._moved import names_of
 from .clock import describe_load
 from .errors import ConnectionLost, HalError, StaleStateError
 from .geometry import Pose
@@ -444,6 +443,3 @@ def frame_from_color(spec: CameraSpec) -> Pose:
     """Return the pose of the frames' optical frame in the colour sensor's, from the figures of the model."""
     sensor = spec.sensors.get(spec.reference)
     return Pose(sensor.position, sensor.orientation) if sensor is not None else Pose()
-
-
-__getattr__ = names_of(__name__)

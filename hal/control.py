@@ -316,7 +316,6 @@ class Control:
         grip: float | None = None,
         width: float | None = None,
         force: float | None = None,
-        gripper: float | None = None,
         t_event: float | None = None,
     ) -> Sent:
         """Send a command to the arm, and optionally a grip or a width to its gripper. Any thread may call it.
@@ -326,7 +325,6 @@ class Control:
             grip: Grip from 0 (open) to 1 (closed); None leaves the gripper alone.
             width: Distance between the fingers, m, instead of ``grip``.
             force: Greatest force on an object in between, N; the gripper's default if left out.
-            gripper: Former name of ``grip``, deprecated.
             t_event: Time of the pad event behind the command, s, for latency figures; None or -inf without one.
 
         Returns:
@@ -342,12 +340,6 @@ class Control:
             ControlTaken: The arm does not follow this session any more (``code`` is ``session_ended``).
             ConnectionLost: The process that owns the arm is gone.
         """
-        if gripper is not None:
-            warnings.warn(
-                "send(gripper=) is deprecated: pass grip= (0 open to 1 closed) or width= (m)",
-                DeprecationWarning,
-                stacklevel=2,
-            )
         self._require_open()
         t_event = 0.0 if t_event is None or t_event == -math.inf else number("t_event", t_event, "s")
         servo = self._peek()
@@ -363,7 +355,7 @@ class Control:
                 "the servo refused an earlier command: a first target too far away, too late, or torques and another "
                 "kind of command without a rest in between"
             )
-        target = self._finger_target(grip, width, gripper, force)
+        target = self._finger_target(grip, width, force)
         if command is not None:
             if self._goal is not None or self._path is not None:
                 raise CommandError("this session makes one motion; it takes no commands", code="move_to_session")
@@ -484,20 +476,20 @@ class Control:
         self.robot._latch.acknowledge(seen)
 
     def _finger_target(
-        self, grip: float | None, width: float | None, former: float | None, force: float | None
+        self, grip: float | None, width: float | None, force: float | None
     ) -> tuple[float, float] | None:
         """Return the width, m, and force, N, that ``send`` asks of the gripper, or None; checked before it is sent."""
-        given = {"grip": grip, "width": width, "gripper": former}
-        passed = {name: value for name, value in given.items() if value is not None}
-        if not passed:
+        if grip is None and width is None:
             return None
-        if len(passed) > 1:
-            raise CommandError(f"pass one of grip= (0 open to 1 closed) and width= (m), not {' and '.join(passed)}")
+        if grip is not None and width is not None:
+            raise CommandError("pass one of grip= (0 open to 1 closed) and width= (m), not both")
         gripper = self.robot.gripper
         if gripper is None:
             raise NotSupported(f"{self.robot.name} has no gripper", code="no_gripper")
-        ((name, value),) = passed.items()
-        width, _, force = gripper._checked(value if name == "width" else gripper.width_of(value), None, force)
+        if grip is not None:
+            width = gripper.width_of(grip)
+        assert width is not None
+        width, _, force = gripper._checked(width, None, force)
         return width, force
 
     def _send_fingers(self, target: tuple[float, float], waiting: bool, reasons: list[str]) -> None:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ._moved import names_of
 from .deadman import Deadman, Threshold
 from .driver import PadReading
 from .errors import DeviceNotFound
@@ -353,6 +352,3 @@ def without_dead_zone(value: float, zone: float) -> float:
     if not abs(value) > zone or zone >= 1.0:
         return 0.0
     return math.copysign(min(1.0, (abs(value) - zone) / (1.0 - zone)), value)
-
-
-__getattr__ = names_of(__name__)

@@ -6,7 +6,6 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn
 
-from ._moved import names_of
 from .arguments import number
 from .errors import ConnectionLost, Fault, MotionStopped, RobotFault, StaleStateError
 from .host.records import GripperAct, GripperCommand
@@ -382,6 +381,3 @@ class GripperResult:
 
     def __bool__(self) -> bool:
         return self.outcome is GripperOutcome.DONE
-
-
-__getattr__ = names_of(__name__)

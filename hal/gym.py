@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from ._moved import names_of
 from .learning.gym import ActionKind, ObservationDict, RigEnv
 from .learning.vector import RigVectorEnv, make_vec
 
 __all__ = ["ActionKind", "ObservationDict", "RigEnv", "RigVectorEnv", "make_vec"]
-
-__getattr__ = names_of(__name__)

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from . import registry
-from ._moved import names_of
 from .errors import HalError
 from .specs import CameraSpec, RobotSpec
 
@@ -255,6 +254,3 @@ def _text(path: Path) -> str | None:
         return path.read_text(errors="replace").strip()
     except OSError:
         return None
-
-
-__getattr__ = names_of(__name__)

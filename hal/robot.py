@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._moved import names_of
 from .arguments import number, vector
 from .clock import describe_load
 from .control import Control, check_deadman
@@ -516,6 +515,3 @@ def _waypoints(target: object) -> list[Any] | None:
     except (TypeError, ValueError, OverflowError):
         return None
     return list(points) if points.ndim == 2 and len(points) else None
-
-
-__getattr__ = names_of(__name__)

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ._moved import RenamedAttribute
 from .errors import CommandError
 from .geometry import Pose
 from .host.hosts import Host
@@ -84,8 +83,6 @@ class Console(ABC):
     @abstractmethod
     def show_camera(self, camera: Camera) -> None:
         """Display a camera's frames to the pages that show it."""
-
-    show = RenamedAttribute("show_camera")
 
     @abstractmethod
     def say(self, text: str) -> None:

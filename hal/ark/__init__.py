@@ -5,10 +5,7 @@
 the rig's YAML and the report, and ``importing`` runs the import.
 """
 
-from .._moved import names_of
 from .entries import ArkOptions
 from .importing import Imported, import_ark
 
 __all__ = ["ArkOptions", "Imported", "import_ark"]
-
-__getattr__ = names_of(__name__)

@@ -17,8 +17,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .._moved import names_of
-
 if TYPE_CHECKING:
     from .board import Board as Board
     from .board import load_board as load_board
@@ -51,14 +49,13 @@ _MODULES = {
     "solving": ("LEAST_VIEWS", "Calibration", "CalibrationFailed", "Eye", "Uncertainty", "View", "solve"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
-_find_moved = names_of(__name__)
 
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
-        return _find_moved(name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
     globals()[name] = value
     return value

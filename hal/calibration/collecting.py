@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .._moved import RenamedAttribute
 from ..errors import CommandError, MotionStopped, StaleStateError, Unreachable
 from ..geometry import Pose
 from .board import Board
@@ -100,8 +99,6 @@ class Collector:
             raise
         self.views.append(view)
         return view
-
-    take = RenamedAttribute("take_view")
 
     def _capture(self) -> View:
         self._wait_for_rest()

@@ -20,7 +20,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .._moved import RenamedAttribute
 from ..errors import DriverMissing, HalError
 from ..geometry import Pose
 from .detection import BoardDetection
@@ -114,7 +113,6 @@ class View:
     """Joint positions (n,), rad."""
     T_color_eye: Pose = field(default_factory=Pose)
     """Optical frame of the image in that of the colour sensor; the same in all views of a camera."""
-    sighting = RenamedAttribute("detection")
 
 
 @dataclass(frozen=True)
@@ -174,9 +172,6 @@ class Calibration:
     uncertainty: Uncertainty
     focal: float
     """Focal length of the camera, pixels."""
-    arm = RenamedAttribute("arm_error")
-    doubt = RenamedAttribute("uncertainty")
-    doubtful = RenamedAttribute("doubts")
 
     @property
     def used(self) -> tuple[Residual, ...]:

@@ -8,14 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .._moved import names_of
-
 if TYPE_CHECKING:
     from .arm import Kinematics
 
 __all__ = ["Kinematics"]
-
-_find_moved = names_of(__name__)
 
 
 def __getattr__(name: str) -> Any:
@@ -23,4 +19,4 @@ def __getattr__(name: str) -> Any:
         from .arm import Kinematics
 
         return Kinematics
-    return _find_moved(name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

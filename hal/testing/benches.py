@@ -16,7 +16,6 @@ from typing import Any, ClassVar, TypeVar
 
 import pytest
 
-from .._moved import RenamedAttribute
 from ..clock import Clock, RealClock
 from ..driver import CameraDriver, GamepadDriver, GripperDriver, RobotDriver
 from ..errors import ConnectionLost, HalError, StaleStateError
@@ -93,8 +92,6 @@ class Bench:
     def was_given(self, ability: str) -> bool:
         """Return whether the bench was made with a function for an ability."""
         return callable(getattr(self, ability, None)) and self.has(ability)
-
-    gave = RenamedAttribute("was_given")
 
     def pass_time(self) -> float:
         """Let one cycle pass, and return the time after it, s."""

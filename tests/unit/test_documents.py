@@ -1,12 +1,10 @@
-"""What the documents state about the code is true: numbers of the safety rules, names of files, moved names."""
+"""What the documents state about the code is true: numbers of the safety rules, names of files."""
 
 import importlib
 import re
 from pathlib import Path
 
 import pytest
-
-from hal import _moved
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -33,14 +31,3 @@ def test_the_files_that_a_document_names_are_there(document: Path) -> None:
         assert (ROOT / path).is_file(), path
     for path, test in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
         assert f"def {test}(" in (ROOT / path).read_text(), f"{path} has no {test}"
-
-
-def test_the_changelog_has_every_moved_name() -> None:
-    rows = re.findall(r"^\| (`.*) \| (`.*) \|$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    shown = [(set(re.findall(r"`(.*?)`", old)), set(re.findall(r"`(.*?)`", new))) for old, new in rows]
-    moved = [({old}, {new}) for old, new in _moved.MODULES.items()]
-    for module, names in _moved.NAMES.items():
-        for old, (home, _, new) in ((old, path.rpartition(".")) for old, path in names.items()):
-            moved.append(({module, old}, {home} if new == old else {home, new}))
-    missing = [(old, new) for old, new in moved if not any(old <= left and new <= right for left, right in shown)]
-    assert not missing

@@ -15,7 +15,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
-from ..._moved import names_of
 from ...errors import CommandError
 from ..dataset import Dataset
 from .actions import ActionForm, ActionKind, RotationForm
@@ -138,6 +137,3 @@ def export(
 def _bytes(path: Path) -> int:
     files = [path] if path.is_file() else path.rglob("*")
     return sum(file.stat().st_size for file in files if file.is_file())
-
-
-__getattr__ = names_of(__name__)

@@ -251,12 +251,6 @@ def test_a_grip_or_a_width_is_sent_with_a_command(
     assert gripper.state().width_target == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_former_name_of_a_grip_is_deprecated(rig: hal.Rig, gripper: hal.Gripper) -> None:
-    with pytest.warns(DeprecationWarning, match="grip="):
-        send(rig, gripper=1.0)
-    assert gripper.state().width_target == 0.0
-
-
 @pytest.mark.parametrize(
     "passed",
     [
