@@ -11,7 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from math import nan
+from math import cos, nan, sin
 from pathlib import Path
 from typing import Any
 
@@ -484,23 +484,25 @@ def test_a_rig_cannot_give_a_real_arm_any_speed() -> None:
         pass
 
 
-def first_commands(arm: hal.Robot, now: float, angle: float, distance: float) -> dict[str, hal.Command]:
+def first_commands(arm: hal.Robot, now: float, share: float) -> dict[str, hal.Command]:
+    """Return first commands this share of the greatest distance away."""
     pose = arm.state().tcp
-    q = arm.home + np.array([0, 0, 0, 0, 0, 0, angle])
+    q = arm.home + np.array([0, 0, 0, 0, 0, 0, 0.1 * share])
     return {
         "target": JointTarget(q),
         "chunk": hal.JointChunk([now, now + 1.0], [q, q]),
-        "pose": hal.CartesianTarget(hal.Pose(pose.position + [0.0, 0.0, distance], pose.orientation)),
+        "pose": hal.CartesianTarget(hal.Pose(pose.position + [0.0, 0.0, 0.05 * share], pose.orientation)),
+        "turned pose": hal.CartesianTarget(pose @ hal.Pose([0.0] * 3, [0.0, 0.0, sin(0.1 * share), cos(0.1 * share)])),
     }
 
 
-@shows("distance of a first joint target", "the same for a first pose")
-@pytest.mark.parametrize("kind", ["target", "chunk", "pose"])
+@shows("distance of a first joint target", "the same for a first pose", "its turn")
+@pytest.mark.parametrize("kind", ["target", "chunk", "pose", "turned pose"])
 @pytest.mark.parametrize("near", [True, False])
 def test_a_first_target_is_near(kind: str, near: bool) -> None:
     with mock_rig() as rig, rig.robots["panda"].control() as control:
         share = 0.99 if near else 1.01
-        command = first_commands(control.robot, rig.clock.now(), 0.1 * share, 0.05 * share)[kind]
+        command = first_commands(control.robot, rig.clock.now(), share)[kind]
         loop = Loop(rig, control, command)
         if near:
             assert loop.drive() is None
