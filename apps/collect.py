@@ -51,7 +51,8 @@ def parser() -> argparse.ArgumentParser:
         "--streams",
         default="color,depth",
         metavar="NAMES",
-        help="streams to record: color, depth, infrared, infrared_right, segmentation (%(default)s)",
+        help="streams to record: color, depth, infrared, infrared_right, segmentation; objects: their poses as an "
+        "observation (%(default)s)",
     )
     what.add_argument("--no-depth", dest="depth", action="store_false", help="do not record depth")
     what.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")

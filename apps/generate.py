@@ -68,7 +68,11 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--out", required=True, metavar="DIR", help="dataset to generate")
     run.add_argument("--cameras", metavar="NAMES", help="cameras to record, or none (default: all)")
     run.add_argument(
-        "--streams", default="color,depth", metavar="NAMES", help="streams to record of the cameras (%(default)s)"
+        "--streams",
+        default="color,depth",
+        metavar="NAMES",
+        help="streams to record: color, depth, infrared, infrared_right, segmentation; objects: their poses as an "
+        "observation (%(default)s)",
     )
     run.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")
     where = made.add_argument_group("workers")

@@ -26,6 +26,7 @@ from hal.apps._common import run_app
 from hal.errors import CommandError, DriverMissing
 
 STATE, IMAGES, ACTION = "observation.state", "observation.images.", "action"
+ENVIRONMENT = "observation.environment_state"
 GRIPPER = "gripper"
 LISTENING = "listening at "
 """Begins the line with the server's address, which ``apps/rollout.py`` reads."""
@@ -111,8 +112,8 @@ def describe(info: Mapping[str, Any], inputs: Collection[str]) -> dict[str, Any]
         inputs: Names of the features that the policy uses.
 
     Raises:
-        CommandError: The policy uses other columns than the state and the pictures (code ``unknown_input``), or the
-            recording is of another program (``foreign_dataset``).
+        CommandError: The policy uses other columns than the state, the poses of objects and the pictures (code
+            ``unknown_input``), or the recording is of another program (``foreign_dataset``).
     """
     features = info["features"]
     names = list(features[ACTION]["names"] or [])
@@ -141,6 +142,9 @@ def describe(info: Mapping[str, Any], inputs: Collection[str]) -> dict[str, Any]
     for key in inputs:
         if key == STATE:
             observation[key] = {"state": state}
+        elif key == ENVIRONMENT and key in features:
+            objects = [name.rpartition(".")[0] for name in features[key]["names"]]
+            observation[key] = {"objects": list(dict.fromkeys(objects))}
         elif key.startswith(IMAGES):
             observation[key] = {"camera": key.removeprefix(IMAGES), "size": features[key]["shape"][:2]}
         else:
@@ -181,7 +185,8 @@ class LeRobotPolicy:
         config.device = device
         self.kind: str = config.type
         pictures = list(config.image_features)
-        self.inputs = [*([STATE] if config.robot_state_feature is not None else []), *pictures]
+        numbers = {STATE: config.robot_state_feature, ENVIRONMENT: config.env_state_feature}
+        self.inputs = [*(key for key, feature in numbers.items() if feature is not None), *pictures]
         self._torch, self._device = torch, device
         self._policy = factory.get_policy_class(config.type).from_pretrained(checkpoint, config=config)
         self._policy.eval()

@@ -124,7 +124,7 @@ class RemotePolicy:
         """The arms that the policy moves, by name."""
         self._dt = 1.0 / self.config.rate_hz
         self._numbers = self.config.numbers(used)
-        self._roboarena = False
+        self._roboarena = self._resets = False
         self._rtc_delay: int | None = None
         """Greatest number of actions that the server takes as given; None if it takes none."""
         self._session_id = ""
@@ -172,7 +172,7 @@ class RemotePolicy:
         self._splice = 0.0
         self._connect()
         self._session_id = str(uuid.UUID(int=0 if seed is None else seed))
-        if self._roboarena:
+        if self._resets:
             self._result(self.client.request({"endpoint": "reset", "session_id": self._session_id}))
 
     def restart(self) -> None:
@@ -225,6 +225,7 @@ class RemotePolicy:
         joints_only = all(action.kind != "tcp_delta" for action in self.config.actions)
         self._rtc_delay = most if type(most) is int and most > 0 and joints_only else None
         self._roboarena = "action_space" in metadata
+        self._resets = self._roboarena or metadata.get("resets") is True
         if not self._roboarena:
             return
         count, size = metadata.get("n_external_cameras", 0), metadata.get("image_resolution")
@@ -279,7 +280,7 @@ class RemotePolicy:
         return config
 
     def _ask(self, observation: Observation, now: float, timeout: float | None = None) -> None:
-        request = self.config.request(observation, self._used, self.task)
+        request = self.config.request(self.rig, observation, self._used, self.task)
         if self._rtc_delay is not None and (prefix := self._prefix(observation, now)) is not None:
             request["rtc"] = prefix
         if self._roboarena:

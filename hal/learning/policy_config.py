@@ -64,7 +64,7 @@ PixelCount = Annotated[int, Field(ge=8, le=4096)]
 
 
 class Source(Strict):
-    """Where an entry of a request comes from: a camera's picture, numbers of the arm, or a text; one of the three."""
+    """Where an entry of a request comes from: a camera's picture, an arm's numbers, objects' poses, or a text: one."""
 
     camera: str | None = None
     """Name of the camera in the rig whose picture is sent, uint8 RGB."""
@@ -78,6 +78,9 @@ class Source(Strict):
     """Numbers, float32, one after the other: ``q`` (n,) rad, ``dq`` (n,) rad/s; of the tcp in the base frame
     ``tcp_position`` (3,) m, ``tcp_quaternion`` (4,) as x, y, z, w, ``tcp_rpy`` (3,) and ``tcp_rotvec`` (3,) rad; of the
     gripper ``width`` in m, ``open`` and ``closed`` from 0 to 1. ``left.q`` is that of the arm with this name."""
+    objects: list[str] | None = None
+    """Names of objects of a simulation, whose poses in the world are sent as float32, one after the other: x, y, z in
+    m, and the quaternion as x, y, z, w. A rig without a simulated world has none."""
     scale: float | list[float] = 1.0
     """Factor of the numbers, one for all or one for each."""
     offset: float | list[float] = 0.0
@@ -89,8 +92,8 @@ class Source(Strict):
 
     @model_validator(mode="after")
     def _one_source(self) -> Source:
-        if sum(value is not None for value in (self.camera, self.state, self.text)) != 1:
-            raise ValueProblem("needs one of camera, state and text", "conflict")
+        if sum(value is not None for value in (self.camera, self.state, self.objects, self.text)) != 1:
+            raise ValueProblem("needs one of camera, state, objects and text", "conflict")
         return self
 
     @property
@@ -333,14 +336,21 @@ class PolicyConfig(Strict):
         """Return the arms that the policy moves and those that it sees, by name; ``robot`` if the file names none.
 
         Raises:
-            DeviceNotFound: A robot or a camera is missing; names those that are needed and those that are there.
+            DeviceNotFound: A robot, a camera or an object is missing; names those that are needed and those that are
+                there.
             NotSupported: The policy uses a gripper, and the arm has none; or the columns of an arm are more or fewer
-                than its joints, and a gripper's.
+                than its joints, and a gripper's; or it sees objects, and the rig is not simulated.
         """
         moved = [action.robot or robot.name for action in self.actions]
         seen = [arm for source in self.observation.values() for arm, _ in source.names if arm]
         robots = _found("robots", [*moved, *seen], rig.robots)
         _found("cameras", self.cameras(), rig.cameras)
+        if objects := [name for source in self.observation.values() for name in source.objects or ()]:
+            if not rig.has_world:
+                raise NotSupported(
+                    "the policy sees poses of objects, which only a simulation knows", code="policy_mismatch"
+                )
+            _found("objects", objects, dict.fromkeys(rig.world.bodies))
         for name, action in zip(moved, self.actions, strict=True):
             arm, numbers = robots[name], action.numbers(robots[name].n)
             first, end = action.columns or (0, numbers)
@@ -368,8 +378,8 @@ class PolicyConfig(Strict):
         ends = [action.columns[1] for action in self.actions if action.columns is not None]
         return max(ends) if ends else self.actions[0].numbers(next(iter(robots.values())).n)
 
-    def request(self, observation: Observation, robots: Mapping[str, Robot], task: str) -> dict[str, Any]:
-        """Return the request for an observation.
+    def request(self, rig: Rig, observation: Observation, robots: Mapping[str, Robot], task: str) -> dict[str, Any]:
+        """Return the request for an observation; objects are where they are now.
 
         Raises:
             NotSupported: A camera has no colour, or a scale or an offset has another length than the numbers.
@@ -386,6 +396,10 @@ class PolicyConfig(Strict):
             elif source.names:
                 numbers = [_state(name, observation, robots[arm] if arm else first) for arm, name in source.names]
                 value = _scaled(np.concatenate(numbers), source).astype(np.float32)
+            elif source.objects is not None:
+                poses = rig.world.poses(source.objects).poses
+                parts = [part for name in source.objects for part in (poses[name].position, poses[name].orientation)]
+                value = _scaled(np.concatenate(parts), source).astype(np.float32)
             (request if source.within is None else request.setdefault(source.within, {}))[key] = value
         return request
 
@@ -440,7 +454,7 @@ def _found(kind: str, needed: Iterable[str], there: Mapping[str, T]) -> dict[str
 def _scaled(numbers: Array, source: Source) -> Array:
     for factor in (source.scale, source.offset):
         if isinstance(factor, list) and len(factor) != numbers.size:
-            names = ", ".join(name for _, name in source.names)
+            names = ", ".join(source.objects or [name for _, name in source.names])
             raise NotSupported(
                 f"the policy's file scales {len(factor)} numbers, and {names} are {numbers.size}",
                 code="policy_mismatch",

@@ -273,7 +273,8 @@ class PolicyServer:
 
         Args:
             infer: Returns the reply to a request, a map with the key ``actions`` (steps, numbers).
-            reset: Called for a request whose ``endpoint`` is ``reset``.
+            reset: Called for a request whose ``endpoint`` is ``reset``, which begins an episode; clients are told that
+                they may ask for it (``resets`` in the metadata).
             metadata: What a client gets on connecting.
             host: Address to listen at.
             port: Port; 0 for a free one.
@@ -282,7 +283,8 @@ class PolicyServer:
             DriverMissing: aiohttp or msgpack is not installed.
         """
         _msgpack(), _aiohttp()
-        self._infer, self._reset, self._metadata = infer, reset, dict(metadata or {})
+        self._infer, self._reset = infer, reset
+        self._metadata = dict(metadata or {}) | ({} if reset is None else {"resets": True})
         self._host, self.port = host, port
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="policy-server", daemon=True)

@@ -24,6 +24,7 @@ __all__ = [
     "ACTION",
     "AFTERWARDS",
     "BOOKKEEPING",
+    "ENVIRONMENT",
     "CameraSetup",
     "Column",
     "GRID",
@@ -33,6 +34,7 @@ __all__ = [
     "GRIP_FORCE",
     "GROUP",
     "MORE_STREAMS",
+    "OBJECTS",
     "PAD",
     "SEGMENTATION",
     "SETPOINT",
@@ -70,6 +72,8 @@ policy must not learn from, because it contains the answer or is unknown on a ro
 GRIP_FORCE = "rig.setpoint_force"
 """Force that was asked of each gripper, N."""
 TAU_EXT, WRENCH_EXT = "rig.tau_ext", "rig.wrench_ext"
+ENVIRONMENT = "observation.environment_state"
+"""LeRobot's key for what a policy sees of the world beside the robot: here the poses of objects."""
 """External torques, Nm, and the external wrench at the tcp, N and Nm, as the arm estimates them."""
 PAD = "rig.pad"
 SUCCESS = "next.success"
@@ -86,6 +90,8 @@ GRID = f"{TIMES}grid"
 SEGMENTATION = "segmentation"
 MORE_STREAMS = tuple(stream for stream in STREAMS if stream not in ("color", "depth"))
 """Streams of a camera that are recorded only on request."""
+OBJECTS = "objects"
+"""Requested beside streams, it records the poses of the simulation's objects as an observation."""
 BOOKKEEPING: dict[str, str] = {
     "timestamp": "float32",
     "frame_index": "int64",

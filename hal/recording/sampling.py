@@ -21,9 +21,11 @@ from ..errors import CommandError, ConnectionLost, DeviceNotFound, StaleStateErr
 from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, Stamp
 from .codecs import depth_unit_for
 from .layout import (
+    ENVIRONMENT,
     GRID,
     GRIP_FORCE,
     MORE_STREAMS,
+    OBJECTS,
     PAD,
     SETPOINT,
     SOURCE,
@@ -340,15 +342,22 @@ class RowSampler:
     """Makes the rows of a rig; :attr:`columns` describes their numbers, in order.
 
     With several arms, a column holds the joints of one after the other, and their names begin with the arm's. A dataset
-    that is continued gets no forces and no controls of pads that its first episodes do not have.
+    that is continued gets no forces and no controls of pads that its first episodes do not have, and the same objects.
 
     Args:
         rig: An open rig.
         cameras: Cameras that are recorded.
         known: Names of the numbers of each column of the dataset; None for a new one.
+        objects: Whether the poses of the objects are an observation, too.
     """
 
-    def __init__(self, rig: Rig, cameras: Iterable[str], known: Mapping[str, Sequence[str]] | None = None) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        cameras: Iterable[str],
+        known: Mapping[str, Sequence[str]] | None = None,
+        objects: bool = False,
+    ) -> None:
         self._rig = rig
         self.source: Callable[[], str] = str
         """Returns who drives: one of :data:`~hal.recording.layout.SOURCES`."""
@@ -375,6 +384,8 @@ class RowSampler:
             self._add(f"rig.camera_pose.{name}", _POSE)
         for name in self._objects:
             self._add(f"rig.object.{name}", _POSE)
+            if objects or ENVIRONMENT in (known or {}):
+                self._add(ENVIRONMENT, [f"{name}.{part}" for part in _POSE])
         if self._objects:
             self._add(f"{TIMES}objects", ["t"], "float64")
         self._add(SOURCE, ["source"], "int64")
@@ -480,7 +491,9 @@ class RowSampler:
             put(f"{TIMES}camera.{name}", _stamp(frame.stamp))
             put(f"rig.camera_pose.{name}", _pose(frame.T_world_camera))
         for name in self._objects:
-            put(f"rig.object.{name}", _pose(snapshot.objects.get(name)))
+            pose = _pose(snapshot.objects.get(name))
+            put(f"rig.object.{name}", pose)
+            put(ENVIRONMENT, pose)
         if self._objects:
             put(f"{TIMES}objects", [snapshot.t_objects])
         put(SOURCE, [snapshot.source])
@@ -519,7 +532,7 @@ def select_devices(
     Args:
         rig: An open rig.
         cameras: Names of the cameras; None for all.
-        streams: Streams to record of the cameras that have them.
+        streams: Streams to record of the cameras that have them; ``objects`` for poses of objects as an observation.
         known: Names of the numbers of each column of the dataset that is continued; None for a new one.
 
     Returns:
@@ -530,11 +543,15 @@ def select_devices(
         StaleStateError: The state of an arm is not available.
         ConnectionLost: A device is lost.
     """
-    if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
-        there = ", ".join(("color", "depth", *MORE_STREAMS))
-        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {there}", code="unknown_stream")
+    there = ("color", "depth", *MORE_STREAMS, OBJECTS)
+    if unknown := [stream for stream in streams if stream not in there]:
+        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {', '.join(there)}", code="unknown_stream")
     if not rig.robots:
         raise CommandError("this rig has no arm to record", code="no_arm")
+    if OBJECTS in streams and not movable_objects(rig):
+        raise CommandError(
+            "poses of objects can be recorded where a simulation has movable ones; this rig has none", code="no_objects"
+        )
     names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
     buffers, notes = [], []
     for name in names:
@@ -556,7 +573,7 @@ def select_devices(
         file_names = [name for each in files for name in each]
         if double := [name for name in file_names if file_names.count(name) > 1]:
             raise CommandError(f"two streams would be called {double[0]}: rename a camera", code="duplicate_name")
-    sampler = RowSampler(rig, [buffer.camera.name for buffer in buffers], known)
+    sampler = RowSampler(rig, [buffer.camera.name for buffer in buffers], known, OBJECTS in streams)
     if sampler.left_out:
         notes.append(f"not recorded, for the dataset does not have them: {', '.join(sampler.left_out)}")
     for buffer in buffers:

@@ -11,11 +11,14 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from demonstrations import is_lifted
 
 import hal
 from hal.apps import collect, generate, rollout
+from hal.apps.serve_lerobot import ENVIRONMENT, STATE, describe
+from hal.learning.remote import PolicyServer
 from hal.learning.replay import RecordedTrajectory, TrajectoryPlayer
 from hal.recording import Dataset, Episode
 
@@ -32,9 +35,9 @@ SKILLS = pytest.mark.parametrize(("skill", "engine"), _PAIRS if SOAK else _PAIRS
 BARE = ["--sim", "--set", "cameras={}"]
 
 
-def generated(out: Path, skill: str, engine: str, episodes: int) -> list[Episode]:
+def generated(out: Path, skill: str, engine: str, episodes: int, *more: str) -> list[Episode]:
     """Return generated episodes, of which at least 19 of 20 are successes."""
-    options = ["--episodes", str(episodes), "--workers", "2", "--out", str(out)]
+    options = ["--episodes", str(episodes), "--workers", "2", "--out", str(out), *more]
     assert generate.main(["--skill", skill, "--engine", engine, *BARE, *options]) == 0
     found = Dataset(out).episodes
     assert sum(one.success is True for one in found) >= 0.95 * episodes
@@ -85,3 +88,46 @@ def test_a_regression_of_the_demonstrations_lifts_the_cube(
     rollout.main([*judged, *BARE, "--set", "simulation.clock=lock_step", "--engine", engine, "--seconds", "7", *unseen])
     report = json.loads((tmp_path / "report.json").read_text())
     assert sum(one["success"] is True for one in report["episodes"]) >= 0.9 * episodes
+
+
+class Recall:
+    """A policy that sees numbers only: it plays the demonstration of the most similar scene on from the nearest row."""
+
+    def __init__(self, episodes: list[Episode]) -> None:
+        self.demonstrations = [{key: one.columns[key] for key in (ENVIRONMENT, STATE, "action")} for one in episodes]
+        self.unlike: list[float] = []
+        """Distance of each scene from the most similar demonstration's, m and numbers of the quaternions."""
+        self.row = -1
+
+    def reset(self, request: object) -> None:
+        self.row = -1
+
+    def infer(self, request: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        if self.row < 0:
+            away = [abs(one[ENVIRONMENT][0] - request[ENVIRONMENT]).max() for one in self.demonstrations]
+            self.unlike.append(float(min(away)))
+            self.followed = self.demonstrations[int(np.argmin(away))]
+        ahead = self.followed[STATE][self.row + 1 : self.row + 60]
+        if len(ahead):
+            self.row += 1 + int(np.argmin(np.square(ahead - request[STATE]).sum(axis=1)))
+        rows = np.minimum(np.arange(self.row, self.row + 40), len(self.followed["action"]) - 1)
+        return {"actions": self.followed["action"][rows]}
+
+
+@ENGINES
+def test_a_served_policy_sees_the_objects_as_they_were_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str
+) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2])
+    found = generated(tmp_path / "out", "examples.pick:pick", engine, 3, "--streams", "objects")
+    poses = [found[0].columns[f"rig.object.{name}"] for name in ("cube", "duck")]
+    assert np.array_equal(found[0].columns[ENVIRONMENT], np.hstack(poses))
+    metadata = describe(json.loads((tmp_path / "out" / "meta" / "info.json").read_text()), [STATE, ENVIRONMENT])
+    policy = Recall(found)
+    judged = ["--success", f"demonstrations:{is_lifted.__name__}", "--report", str(tmp_path / "report.json")]
+    options = ["--set", "simulation.clock=lock_step", "--engine", engine, "--seconds", "12", "--episodes", "3"]
+    with PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, port=0) as server:
+        rollout.main(["--policy", server.url, *judged, *BARE, *options])
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [one["success"] for one in report["episodes"]] == [True] * 3, report
+    assert max(policy.unlike[-3:]) < 5e-3, "but for the cube that settles, after a rehearsal in another scene"

@@ -38,7 +38,7 @@ def test_built_in_files_fit_the_built_in_rig(name: str) -> None:
     config = load_policy_config(name)
     with hal.open("panda_table", driver="mock") as rig:
         robots = config.robots(rig, rig.robots["panda"])
-        request = config.request(rig.observe(), robots, "wave")
+        request = config.request(rig, rig.observe(), robots, "wave")
     pictures = [value for value in request.values() if getattr(value, "dtype", None) == np.uint8]
     assert [picture.shape for picture in pictures] == 2 * [(224, 224, 3)]
     assert request["prompt"] == "wave"
@@ -49,7 +49,7 @@ def test_numbers_are_scaled_and_moved_into_the_policys_frame() -> None:
     config = load_policy_config("libero")
     with hal.open("panda_table", driver="mock") as rig:
         arm, observation = rig.robots["panda"], rig.observe()
-        picture = config.request(observation, rig.robots, "")
+        picture = config.request(rig, observation, rig.robots, "")
     state, tcp = picture["observation/state"], observation.robots["panda"].tcp
     finger = observation.grippers["panda"].width / 2.0
     np.testing.assert_allclose(state[:3], tcp.position + [-0.66, 0.0, 0.912], atol=1e-6)
@@ -61,7 +61,7 @@ def test_numbers_are_scaled_and_moved_into_the_policys_frame() -> None:
                 key: source.model_copy(update={"mirror": False}) for key, source in config.observation.items()
             }
         }
-    ).request(observation, {"panda": arm}, "")
+    ).request(rig, observation, {"panda": arm}, "")
     np.testing.assert_array_equal(picture["observation/image"], plain["observation/image"][:, ::-1])
     assert (picture["observation/image"] != plain["observation/image"]).any()
 
@@ -75,7 +75,7 @@ def test_orientations_become_angles_and_rotation_vectors(rig: hal.Rig) -> None:
     for quaternion in quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True):
         pose = hal.Pose([0.0, 0.0, 0.0], quaternion)
         state = {"panda": replace(observation.robots["panda"], tcp=pose)}
-        request = config.request(replace(observation, robots=state), rig.robots, "")
+        request = config.request(rig, replace(observation, robots=state), rig.robots, "")
         vector, rpy = np.split(request["state"].astype(float), 2)
         assert np.linalg.norm(vector) <= np.pi + 1e-6
         turned = hal.Pose([0.0, 0.0, 0.0], after_rotation([0.0, 0.0, 0.0, 1.0], vector.tolist()))
@@ -87,7 +87,7 @@ def test_columns_of_a_recording_are_asked_for_and_answered_in_metres() -> None:
     config = load_policy_config("lerobot")
     with hal.open("panda_table", driver="mock") as rig:
         arm, observation = rig.robots["panda"], rig.observe()
-        request = config.request(observation, config.robots(rig, arm), "wave")
+        request = config.request(rig, observation, config.robots(rig, arm), "wave")
         decoded = config.decode(np.tile([*np.zeros(7), 0.02], (2, 1)), observation, rig.robots)["panda"]
         assert arm.gripper is not None
         share = 1.0 - 0.02 / arm.gripper.width_max
@@ -99,7 +99,18 @@ def test_columns_of_a_recording_are_asked_for_and_answered_in_metres() -> None:
 def test_a_scale_for_another_number_of_numbers_is_refused(rig: hal.Rig) -> None:
     config = load_policy_config({**CONFIG, "observation": {"state": {"state": ["q", "width"], "scale": [1.0] * 7}}})
     with raises_code(hal.NotSupported, "policy_mismatch"):
-        config.request(rig.observe(cameras=()), rig.robots, "")
+        config.request(rig, rig.observe(cameras=()), rig.robots, "")
+
+
+def test_objects_are_seen_in_a_simulated_world_that_has_them_only(rig: hal.Rig) -> None:
+    config = load_policy_config({**CONFIG, "observation": {"scene": {"objects": ["cup"]}}})
+    with raises_code(hal.NotSupported, "policy_mismatch"):
+        config.robots(rig, rig.robots["panda"])
+    with (
+        hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides={"cameras": {}}) as there,
+        pytest.raises(hal.DeviceNotFound, match=r"cup.*cube"),
+    ):
+        config.robots(there, there.robots["panda"])
 
 
 def test_a_rig_without_the_camera_is_refused_with_both_lists(rig: hal.Rig) -> None:
@@ -145,7 +156,7 @@ def test_pictures_are_scaled_to_fit_and_padded() -> None:
         {**CONFIG, "observation": {"image": {"camera": "scene", "size": [32, 32], "layout": "chw"}}}
     )
     with hal.open("panda_table", driver="mock", overrides=["cameras.scene.output={width: 64, height: 32}"]) as rig:
-        picture = config.request(rig.observe(), rig.robots, "")["image"]
+        picture = config.request(rig, rig.observe(), rig.robots, "")["image"]
     assert picture.shape == (3, 32, 32)
     assert not picture[:, :8].any()
     assert not picture[:, 24:].any()

@@ -283,6 +283,14 @@ def test_the_package_imports_without_its_libraries() -> None:
     assert said.count("pip install 'robot-hal[record]'") == 3
 
 
+def test_poses_of_objects_are_refused_where_nothing_knows_them(tmp_path: Path) -> None:
+    with (
+        hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig,
+        raises_code(CommandError, "no_objects"),
+    ):
+        Recorder(rig, tmp_path / "out", streams=["objects"])
+
+
 def test_infrared_and_segmentation_are_recorded_on_request(tmp_path: Path) -> None:
     out, streams = tmp_path / "out", "[color, depth, infrared, segmentation]"
     overrides = [*small(), f"cameras.scene.streams={streams}"]
