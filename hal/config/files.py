@@ -216,7 +216,7 @@ def check_size(text: str, loader: Any = _SafeLoader) -> None:
     mark: Any
     open_nodes: list[tuple[str | None, int, int]] = [(None, 0, 0)]  # anchor, values, levels below
     anchors: dict[str, tuple[int, int] | None] = {}  # values and levels; None while it is open
-    for event in yaml.parse(text, Loader=loader):
+    for event in _events(text, loader):
         mark = event.start_mark
         if isinstance(event, yaml.CollectionStartEvent):
             open_nodes.append((event.anchor, 1, 1))
@@ -244,6 +244,16 @@ def check_size(text: str, loader: Any = _SafeLoader) -> None:
             raise _TooLarge(problem=f"nested more than {MAX_DEPTH} deep", problem_mark=mark)
         if before + values > MAX_VALUES:
             raise _TooLarge(problem=f"more than {MAX_VALUES} values, those behind aliases included", problem_mark=mark)
+
+
+def _events(text: str, loader: Any) -> Iterator[Any]:
+    """Yield the events of a document. libyaml 0.2.6 refuses a thousand levels that it reads ahead by itself."""
+    try:
+        yield from yaml.parse(text, Loader=loader)
+    except yaml.MarkedYAMLError as error:
+        if "nesting depth" not in (error.problem or ""):
+            raise
+        raise _TooLarge(problem=f"nested more than {MAX_DEPTH} deep", problem_mark=error.problem_mark) from error
 
 
 def _find_duplicates(node: yaml.Node, place: tuple[str, ...], seen: set[int]) -> Iterator[tuple[str, str]]:
