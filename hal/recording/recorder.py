@@ -1,7 +1,7 @@
 """Record the episodes of a rig into a dataset: the public :class:`Recorder`, and what it does during one episode.
 
-A :class:`~hal.recording.sampling.SampleClock` calls :class:`EpisodeRecorder` at every due time; each becomes a row in
-the queue to the writer's process (writer.py), or a dropped row with its reason.
+A :class:`~hal.recording.sample_clock.SampleClock` calls :class:`EpisodeRecorder` at every due time; each becomes a row
+in the queue to the writer's process (writer.py), or a dropped row with its reason.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from .layout import DatasetLayout, features_of, lock_dataset, require_libraries
 from .live import RowQueue
 from .merging import pack_if_loose
 from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
-from .sampling import CameraBuffer, LockStepSampleClock, RealTimeSampleClock, RowSampler, SampleClock, select_devices
+from .sample_clock import LockStepSampleClock, RealTimeSampleClock, SampleClock
+from .sampling import CameraBuffer, RowSampler, select_devices
 
 if TYPE_CHECKING:
     from ..rig import Rig
