@@ -406,8 +406,8 @@ class HandController:
     def update(self, state: HandState) -> None:
         """Process a new state."""
         before, self.state = self.state, state
-        if before is not None and state.t > before.t:
-            self.speed = (state.width - before.width) / (state.t - before.t)
+        if before is not None and state.t_hand > before.t_hand:  # after a stall, states arrive in a bunch
+            self.speed = (state.width - before.width) / (state.t_hand - before.t_hand)
         if not state.is_grasped and state.t > self._t_ended:
             self._force = None
         if self._stop_check is not None and before is not None and before.t > self._stop_check.until:

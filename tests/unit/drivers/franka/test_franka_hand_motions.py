@@ -256,6 +256,13 @@ def test_a_command_that_failed_may_be_tried_again():
         assert (controller.outcome, controller.fault) == (GripperOutcome.FAILED, ABORTED)
 
 
+def test_states_that_arrive_in_a_bunch_are_no_motion():
+    controller = HandController(WidthRange(0.08, 0.002))
+    for arrival, t_hand, width in ((1.0, 1.0, 0.04), (2.0, 1.033, 0.04003), (2.0001, 1.066, 0.04)):
+        controller.update(HandState(arrival, t_hand, width, 0.08, False, 30))
+        assert not controller.moving
+
+
 def test_a_hand_that_is_not_homed_does_nothing_else(bench):
     bench.fingers.homed = False
     bench.pass_time(0.05)
