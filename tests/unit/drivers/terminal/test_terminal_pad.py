@@ -30,7 +30,7 @@ class Bench:
     def __init__(self, far: FarEnd, **options: Any) -> None:
         self.far = far
         self.stops = 0
-        self.now = 1000.0
+        self.now = 1.0  # before the present of a computer that was just started
         spec = PadSpec(name="pad", driver="terminal", model=None, options={"tty": far.path, **options})
         self.driver = TerminalPad(spec, self.stop)
         self.pad = Gamepad(self.driver)
