@@ -146,23 +146,23 @@ class ObjectConfig(Strict):
     @model_validator(mode="after")
     def _sizes(self) -> ObjectConfig:
         needed = SIZES[self.shape]
-        given = [key for key in ("half_extents", "radius", "length", "mesh", "urdf") if getattr(self, key) is not None]
-        missing, extra = [k for k in needed if k not in given], [k for k in given if k not in needed]
-        if missing or extra:
-            keys = ", ".join(needed) or "no size"
-            wrong = [*(f"{key} is missing" for key in missing), *(f"{key} does not apply" for key in extra)]
-            code = "missing_key" if missing else "conflict"
-            raise ValueProblem(f"a {self.shape} has {keys}: {', '.join(wrong)}", code)
-        if self.mass is not None and self.shape == "urdf":
-            raise ValueProblem("mass does not apply to a urdf, which has its own", "conflict")
-        if self.scale is not None and self.shape not in ("urdf", "mesh"):
-            raise ValueProblem(f"scale applies to a urdf or a mesh; a {self.shape} has its size in m", "conflict")
-        if self.parts and self.shape != "mesh":
-            raise ValueProblem(f"parts applies to a mesh only, not to a {self.shape}", "conflict")
-        if self.shape == "plane" and (self.attached is not None or self.random is not None):
-            raise ValueProblem("a plane is infinite; it cannot have attached or random", "conflict")
-        if self.random is not None and self.attached is not None:
-            raise ValueProblem("attached and random exclude each other: the object is where the arm is", "conflict")
+        wrong = [f"{key} is missing" for key in needed if getattr(self, key) is None]
+        code = "missing_key" if wrong else "conflict"
+        others = [key for key in ("half_extents", "radius", "length", "mesh", "urdf") if key not in needed]
+        wrong += [f"{key} does not apply" for key in others if getattr(self, key) is not None]
+        if wrong:
+            raise ValueProblem(f"a {self.shape} has {', '.join(needed) or 'no size'}: {', '.join(wrong)}", code)
+        moves = self.attached is not None, self.random is not None
+        conflicts = {
+            "mass does not apply to a urdf, which has its own": self.mass is not None and self.shape == "urdf",
+            f"scale applies to a urdf or a mesh; a {self.shape} has its size in m": self.scale is not None
+            and self.shape not in ("urdf", "mesh"),
+            f"parts applies to a mesh only, not to a {self.shape}": self.parts and self.shape != "mesh",
+            "a plane is infinite; it cannot have attached or random": self.shape == "plane" and any(moves),
+            "attached and random exclude each other: the object is where the arm is": all(moves),
+        }
+        if text := next((text for text, there in conflicts.items() if there), None):
+            raise ValueProblem(text, "conflict")
         return self
 
 
@@ -212,26 +212,9 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
         entry = entry["file"]
     if isinstance(entry, dict):
         return validate(ObjectConfig, entry, source, problems, key), source, key
-    if not isinstance(entry, str):
-        message = f"must be a file, a name or keys and values, not {describe(entry)}"
-        problems.add(source, key, message, "wrong_type")
-        return None
-    if is_path(entry):
-        path = user_path(entry, base)
-        if not os.path.isfile(path):
-            there = [f"{path.parent.name}/{p.name}" for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            hint = nearest(f"{path.parent.name}/{path.name}", there)
-            problems.add(source, key, f"there is no file {path}{hint}", "missing_file")
-            return None
-    else:
-        there = list(list_data("config", "objects"))
-        if entry not in there:
-            message = f"there is no object {entry!r}{nearest(entry, there)}, or a path to your own"
-            problems.add(source, key, message, "unknown_object")
-            return None
-        path = data_folder("config") / "objects" / f"{entry}.yaml"
-    data = read_yaml(path, problems)
-    if data is None:
+    path = _find_file(entry, source, base, key, problems)
+    data = read_yaml(path, problems) if path is not None else None
+    if path is None or data is None:
         return None
     config = validate(ObjectConfig, data, path, problems)
     if not changes:
@@ -248,6 +231,27 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
         if in_order or problem.key.removeprefix(f"{key}.").partition(".")[0] in changes:
             problems.add(source, problem.key, problem.message, problem.code)
     return changed, str(path), ""
+
+
+def _find_file(entry: object, source: str, base: Path, key: str, problems: Problems) -> Path | None:
+    """Return the file of an object; None, with the problem added, if there is none."""
+    if not isinstance(entry, str):
+        message, code = f"must be a file, a name or keys and values, not {describe(entry)}", "wrong_type"
+    elif is_path(entry):
+        path = user_path(entry, base)
+        if os.path.isfile(path):  # unlike Path.is_file, it has no error for names that are too long
+            return path
+        there = [f"{path.parent.name}/{found.name}" for found in path.parent.glob("*.yaml")]
+        hint = nearest(f"{path.parent.name}/{path.name}", there)
+        message, code = f"there is no file {path}{hint}", "missing_file"
+    else:
+        there = list(list_data("config", "objects"))
+        if entry in there:
+            return data_folder("config") / "objects" / f"{entry}.yaml"
+        message = f"there is no object {entry!r}{nearest(entry, there)}, or a path to your own"
+        code = "unknown_object"
+    problems.add(source, key, message, code)
+    return None
 
 
 def _check_attached(context: Context, carried: CarriedBy, robots: tuple[str, ...], file: str, key: str) -> None:

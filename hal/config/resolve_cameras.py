@@ -177,7 +177,7 @@ def resolve_streams(context: Context, key: str, config: CameraConfig, model: Cam
     _check_formats(context, key, config, model, on)
     _check_together(context, key, model, captures)
     align = config.align or ("color" if "color" in on or "depth" not in on else "depth")
-    if config.align is not None and align not in on:
+    if config.align not in (None, *on):
         message = f"is {align}, which is not one of the enabled streams: {', '.join(on)}"
         context.problem(f"{key}.align", message, "conflict")
     if len(context.problems.found) > before:
@@ -186,10 +186,15 @@ def resolve_streams(context: Context, key: str, config: CameraConfig, model: Cam
     reference = sensors.get(align) or next(iter(sensors.values()), None)
     if reference is None:
         reference = _sensor(config, model, "color", config.capture or model.capture)
-    depth = captures.get("depth")
-    mode = model.stream("depth").mode(depth) if depth is not None and config.depth is None else None
-    nearest_depth = mode.depth_min if mode is not None else None
-    return Streams(sensors, align, reference, nearest_depth or (config.depth or model.depth).min)
+    return Streams(sensors, align, reference, _nearest_depth(config, model, captures.get("depth")))
+
+
+def _nearest_depth(config: CameraConfig, model: CameraModel, capture: Capture | None) -> float:
+    """Return the nearest depth, m: the rig's, else that of the mode, else the model's."""
+    if config.depth is not None:
+        return config.depth.min
+    mode = model.stream("depth").mode(capture) if capture is not None else None
+    return (mode.depth_min if mode is not None else None) or model.depth.min
 
 
 def _captures(on: Sequence[Stream], configs: Mapping[Stream, StreamConfig], default: Capture) -> dict[Stream, Capture]:

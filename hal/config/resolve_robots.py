@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from .. import registry
 from ..kinematics.composition import divide_urdf
-from ..kinematics.urdf import TURNING, UrdfModel, read_urdf
+from ..kinematics.urdf import TURNING, UrdfJoint, UrdfModel, read_urdf
 from ..specs import (
     Floats,
     GripperSpec,
@@ -59,102 +59,119 @@ DEADLINE_SIMULATED, DEADLINE_REAL = 1.0, 0.3
 """Longest deadline of a command, s."""
 
 
+class _Body(NamedTuple):
+    """An arm's URDF, and the numbers of its joints."""
+
+    robot: UrdfModel
+    """The whole robot, which may have other arms."""
+    arm: UrdfModel
+    """The part of it that is this arm's."""
+    limits: LimitsSpec
+    home: Floats
+    initial: Floats | None
+
+
 def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec | None:
     """Return the record of an arm; None, with the problems added, if there are any."""
     key = f"robots.{name}"
     model, file = context.read_model(RobotModel, key, config, "robots")
-    urdf: UrdfModel | None = None
-    with suppress(Unknown):
-        urdf = load_arm(model, file, context.problems, context.warnings)
-    part: UrdfModel | None = None
-    with suppress(Unknown):
-        if urdf is not None:
-            _check_names(model, urdf, file, context.problems)
-            part = _part_of_robot(context, name, config, model, urdf)
-    if part is not None:
-        context.urdfs[name] = part
-    with suppress(Unknown):
-        context.links[name] = model.links
     simulated = True
     with suppress(Unknown):
         simulated = context.simulated(config)
+    body = _resolve_body(context, name, config, model, file, simulated)
+    with suppress(Unknown):
+        context.links[name] = model.links
     with suppress(Unknown):
         if not simulated and config.tcp_speed not in MOST_REAL_TCP_SPEED:
             message = f"must be {MOST_REAL_TCP_SPEED} on a real arm, not {config.tcp_speed:g}"
             context.problem(f"{key}.tcp_speed", message, "out_of_range")
-    limits, home, initial = _joint_numbers(context, key, config, model, file, urdf, simulated)
     driver = context.choose_driver("robot", key, config, model)
     gripper_driver = _check_gripper(context, f"{key}.gripper", config, model)
     with suppress(Unknown):
         _check_workspace(context, f"{key}.workspace", config)
     with suppress(Unknown):
-        if urdf is not None and part is not None and limits is not None and home is not None and driver:
-            options = options_of(config, model, simulated, driver)
-            base = config.base if config.same is None else context.rig.robots[config.same].base
-            shared = options if driver == gripper_driver else {}
-            gripper = _gripper(context, name, config, model, gripper_driver, shared)
-            real = [] if simulated else [(driver, options)]
-            if gripper is not None and not context.simulated(config.gripper, config):
-                real.append((gripper.driver, gripper.options))
-            spec = RobotSpec(
-                name=name,
-                model=config.model,
-                driver=driver,
-                rate_hz=context.rig.simulation.physics_hz if simulated else config.rate_hz or model.rate_hz,
-                urdf=str(part.path),
-                joints=model.joints,
-                home=home,
-                initial=initial or home,
-                limits=limits,
-                kinematics=_kinematics(model, urdf, limits, home),
-                base_position=base.position,
-                base_orientation=base.orientation,
-                gripper=gripper,
-                workspace=_workspace(config.workspace) if config.workspace is not None else None,
-                payload=_payload(context, key, config, driver, simulated),
-                same=config.same,
-                group=None if simulated else _group_key(driver, options),
-                speed=config.speed,
-                move_speed=config.move_speed,
-                tcp_speed=config.tcp_speed,
-                attended=bool(real),
-                emulated=bool(real) and all(is_emulated(*device) for device in real),
-                deadline_max=DEADLINE_SIMULATED if simulated else DEADLINE_REAL,
-                options=options,
-                source=context.source,
-            )
-            if spec.emulated:
-                context.emulated.add(key)
-                if not all(registry.driver(name).steppable for name, _ in real):
-                    context.real_time_only.add(key)
+        if body is not None and driver:
+            spec = _spec(context, name, config, model, body, driver, gripper_driver)
             check_robot_spec(context, key, spec, config, model, file)
             return spec
     return None
 
 
-def _joint_numbers(
-    context: Context,
-    key: str,
-    config: RobotConfig,
-    model: RobotModel,
-    file: Path,
-    urdf: UrdfModel | None,
-    simulated: bool,
-) -> tuple[LimitsSpec | None, Floats | None, Floats | None]:
-    """Return limits, home and initial positions; None for those that are unknown or not given."""
+def _spec(
+    context: Context, name: str, config: RobotConfig, model: RobotModel, body: _Body, driver: str, gripper_driver: str
+) -> RobotSpec:
+    """Return the record of an arm, and note in the context if a program stands in for its real devices."""
+    key, simulated = f"robots.{name}", context.simulated(config)
+    options = options_of(config, model, simulated, driver)
+    base = config.base if config.same is None else context.rig.robots[config.same].base
+    shared = options if driver == gripper_driver else {}
+    gripper = _gripper(context, name, config, model, gripper_driver, shared)
+    real = [] if simulated else [(driver, options)]
+    if gripper is not None and not context.simulated(config.gripper, config):
+        real.append((gripper.driver, gripper.options))
+    emulated = bool(real) and all(is_emulated(*device) for device in real)
+    if emulated:
+        context.emulated.add(key)
+        if not all(registry.driver(name).steppable for name, _ in real):
+            context.real_time_only.add(key)
+    return RobotSpec(
+        name=name,
+        model=config.model,
+        driver=driver,
+        rate_hz=context.rig.simulation.physics_hz if simulated else config.rate_hz or model.rate_hz,
+        urdf=str(body.arm.path),
+        joints=model.joints,
+        home=body.home,
+        initial=body.initial or body.home,
+        limits=body.limits,
+        kinematics=_kinematics(model, body),
+        base_position=base.position,
+        base_orientation=base.orientation,
+        gripper=gripper,
+        workspace=_workspace(config.workspace) if config.workspace is not None else None,
+        payload=_payload(context, key, config, driver, simulated),
+        same=config.same,
+        group=None if simulated else _group_key(driver, options),
+        speed=config.speed,
+        move_speed=config.move_speed,
+        tcp_speed=config.tcp_speed,
+        attended=bool(real),
+        emulated=emulated,
+        deadline_max=DEADLINE_SIMULATED if simulated else DEADLINE_REAL,
+        options=options,
+        source=context.source,
+    )
+
+
+def _resolve_body(
+    context: Context, name: str, config: RobotConfig, model: RobotModel, file: Path, simulated: bool
+) -> _Body | None:
+    """Return an arm's URDF and the numbers of its joints; None, with the problems added, if one is unknown."""
+    key = f"robots.{name}"
+    robot: UrdfModel | None = None
+    arm: UrdfModel | None = None
     limits: LimitsSpec | None = None
     home: Floats | None = None
     initial: Floats | None = None
     with suppress(Unknown):
+        robot = load_arm(model, file, context.problems, context.warnings)
+        if robot is not None:
+            _check_names(model, robot, file, context.problems)
+            arm = _part_of_robot(context, name, config, model, robot)
+            if arm is not None:
+                context.urdfs[name] = arm
+    with suppress(Unknown):
         where = context.source, f"{key}.limits"
-        limits = resolve_limits(model, urdf, file, config, *where, not simulated, context.problems)
+        limits = resolve_limits(model, robot, file, config, *where, not simulated, context.problems)
     with suppress(Unknown):
         home = spread(model.home, len(model.joints), file, "home", "numbers", context.problems)
         _check_inside(home, limits, model.joints, file, "home", context.problems)
     with suppress(Unknown):
         initial = _initial(context, f"{key}.initial", model, config)
         _check_inside(initial, limits, model.joints, context.source, f"{key}.initial", context.problems)
-    return limits, home, initial
+    if robot is None or arm is None or limits is None or home is None:
+        return None
+    return _Body(robot, arm, limits, home, initial)
 
 
 # Arms of one robot
@@ -221,13 +238,13 @@ def _joints_of(context: Context, name: str, config: RobotConfig) -> tuple[str, .
     return ()
 
 
-def _kinematics(model: RobotModel, urdf: UrdfModel, limits: LimitsSpec, home: Floats) -> KinematicsSpec:
+def _kinematics(model: RobotModel, body: _Body) -> KinematicsSpec:
     return KinematicsSpec(
-        urdf=str(urdf.path),
+        urdf=str(body.robot.path),
         joints=model.joints,
-        lower=limits.lower,
-        upper=limits.upper,
-        home=home,
+        lower=body.limits.lower,
+        upper=body.limits.upper,
+        home=body.home,
         base_link=model.base_link,
         tcp_link=model.tcp.link,
         tcp_position=model.tcp.position,
@@ -442,27 +459,25 @@ def _of_model(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, 
 
 
 def _from_urdf(model: RobotModel, urdf: UrdfModel, name: str, file: Path, problems: Problems) -> Floats | None:
-    joints = [urdf.joints.get(joint) for joint in model.joints]
-    if name == "torque":
-        efforts = [joint.effort for joint in joints if joint is not None and joint.effort and joint.effort > 0.0]
-        # In many files an effort of 0 means "unknown".
-        return tuple(efforts) if len(efforts) == len(joints) else None
-    values: list[float] = []
-    lacking: list[str] = []
-    for joint in joints:
-        value: float | None = getattr(joint, name, None)
-        if joint is None or not joint.movable:  # already a problem of the names
-            value = math.nan
-        elif value is None and joint.kind == "continuous" and name in ("lower", "upper"):
-            value = math.copysign(ENDLESS, -1.0 if name == "lower" else 1.0)
-        elif value is None or (name == "velocity" and value <= 0.0):
-            lacking.append(joint.name)
-            value = math.nan
-        values.append(value)
+    values = [_read_limit(urdf.joints.get(joint), name) for joint in model.joints]
+    lacking = [repr(joint) for joint, value in zip(model.joints, values, strict=True) if value is None]
+    if lacking and name == "torque":
+        return None
     if lacking:
-        text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(map(repr, lacking))}"
+        text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(lacking)}"
         problems.add(file, f"limits.{name}", text, "missing_key")
-    return tuple(values)
+    return tuple(math.nan if value is None else value for value in values)
+
+
+def _read_limit(joint: UrdfJoint | None, name: str) -> float | None:
+    """Return a limit from a joint's URDF: None without one, NaN for a joint that does not move."""
+    if joint is None or not joint.movable:  # already a problem of the names
+        return math.nan
+    value: float | None = getattr(joint, "effort" if name == "torque" else name)
+    if name in ("lower", "upper"):
+        endless = value is None and joint.kind == "continuous"
+        return math.copysign(ENDLESS, -1.0 if name == "lower" else 1.0) if endless else value
+    return value if value is not None and value > 0.0 else None  # in many files an effort of 0 means "unknown"
 
 
 def _initial(context: Context, key: str, model: RobotModel, config: RobotConfig) -> Floats | None:
