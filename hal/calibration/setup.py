@@ -104,17 +104,15 @@ def find_setup(
                 code="missing_eye",
             )
         eye = "to-hand" if attached is None else "in-hand"
-    known = spec.view
-    ours = known is not None and (known.robot == arm.name if eye == "in-hand" else known.robot is None)
-    if known is not None and ours and eye == "in-hand" and link in (None, known.link) and attached is not None:
-        chosen, name = known.link or arm.kinematics.tcp_link, link or attached.link
-    else:
-        chosen = name = link or arm.kinematics.tcp_link
-        ours = ours and eye == "to-hand"
+    view, known = spec.view, None
+    chosen = name = link or arm.kinematics.tcp_link
+    if eye == "to-hand":
+        known = view if attached is None else None
+    elif view is not None and attached is not None and attached.robot == arm.name and link in (None, view.link):
+        known, chosen, name = view, view.link or chosen, link or attached.link
     _check_link(arm, chosen)
-    return CalibrationSetup(
-        spec.name, arm.name, eye, chosen, name, Pose(known.position, known.orientation) if known and ours else None
-    )
+    place = Pose(known.position, known.orientation) if known is not None else None
+    return CalibrationSetup(spec.name, arm.name, eye, chosen, name, place)
 
 
 def initial_guess(setup: CalibrationSetup, text: str | None) -> Pose:
