@@ -175,7 +175,7 @@ class ArmMotion:
         with session:
             for _ in clock.rate(CHECK_HZ):
                 servo = session._peek()
-                session._check_trip(servo, clock.now())
+                session._check_trip(servo)
                 if servo.session == session._id:
                     if servo.off_path:
                         raise MotionStopped(
