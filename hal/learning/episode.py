@@ -292,14 +292,12 @@ def reset_scene(
     put = dict(poses or {})
     for name, pose in put.items():
         rig.world.reset(name, pose=pose)
-    if random is not None:
-        drawn = sample_poses(rig, random, given=put)
-        for name, pose in drawn.items():
-            rig.world.reset(name, pose=pose)
-        put |= drawn
+    drawn = {} if random is None else sample_poses(rig, random, given=put)
+    for name, pose in drawn.items():
+        rig.world.reset(name, pose=pose)
     if inside:
         rig.world.reset(robot.name, q=robot.spec.initial if q is None else np.asarray(q, float))
-    return put
+    return put | drawn
 
 
 def _wait_for_press(clock: Clock, deadman: Deadman, since: int, patience: float) -> None:

@@ -266,6 +266,20 @@ class _EnvArm:
         return CartesianTarget(self.goal), grip
 
 
+def _check_lists(**arguments: Collection[str] | None) -> None:
+    """Raise CommandError for one name in the place of a list of them."""
+    for argument, names in arguments.items():
+        if isinstance(names, str):
+            raise CommandError(f"{argument} must be a list of names: [{names!r}]", code="not_a_list")
+
+
+def _check_functions(**arguments: object) -> None:
+    """Raise CommandError for anything that is neither None nor a function."""
+    for argument, function in arguments.items():
+        if function is not None and not callable(function):
+            raise CommandError(f"{argument} must be a function, not {function!r}", code="not_callable")
+
+
 class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """An arm of a rig, or several, with their grippers and cameras, as a Gymnasium environment.
 
@@ -283,6 +297,40 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     ``step`` sends the action, lets one period pass and waits for an observation that was taken after that, so that no
     observation is returned twice. If the arm is stopped (releasing the dead-man is not a stop), the episode is
     truncated and ``info["stopped"]`` has the reason.
+
+    Args:
+        config: The rig's configuration, as for :func:`hal.open`.
+        sim: True for simulated drivers, as for :func:`hal.open`.
+        driver: Driver of all devices, as for :func:`hal.open`.
+        engine: Engine of the simulated world, as for :func:`hal.open`.
+        robot: Name of the arm; None for the rig's first.
+        robots: Names of several arms, instead of ``robot``.
+        action: Kind of action, see :data:`ActionKind`.
+        controller: What makes the arm follow: :class:`hal.Position` by default, :class:`hal.JointImpedance` or
+            :class:`hal.OperationalSpace`. Not for torques.
+        cameras: Names of the observed cameras; None for all.
+        streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``,
+            ``segmentation`` and ``points``; None for colour and depth.
+        objects: Names of the objects of the simulated world whose poses are observed.
+        rate_hz: Steps per second.
+        max_steps: Steps after which an episode is truncated; None for no limit.
+        speeds: Greatest speeds of the tcp for ``twist`` and, per step, for ``tcp_delta``: m/s and rad/s.
+        reward: Called as ``reward(env, observation)`` after each step; None for a reward of 0.
+        terminated: Called as ``terminated(env, observation)`` after each step.
+        on_reset: Called as ``on_reset(env, options)`` after the reset and before the first observation: time for
+            the operator to arrange a real bench, or for a task to move objects with ``env.rig.world`` and
+            ``env.np_random``.
+        deadman: Makes the dead-man from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``;
+            something that really moves needs it, or ``unattended=True``.
+        unattended: Let a real arm move without a dead-man.
+        overrides: Changes of the configuration, ``key=value``.
+        render_mode: None or ``rgb_array``.
+
+    Raises:
+        CommandError: An argument is wrong, also one of the control session (see :meth:`hal.robot.Robot.control`).
+        NotSupported: The rig lacks a stream (code ``unknown_stream``) or a world (``no_world``); the arm takes no
+            controller.
+        DriverMissing: gymnasium is not installed.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # Gymnasium's own name and type
@@ -312,57 +360,13 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         overrides: tuple[str, ...] = (),
         render_mode: str | None = None,
     ) -> None:
-        """Open the rig.
-
-        Args:
-            config: The rig's configuration, as for :func:`hal.open`.
-            sim: True for simulated drivers, as for :func:`hal.open`.
-            driver: Driver of all devices, as for :func:`hal.open`.
-            engine: Engine of the simulated world, as for :func:`hal.open`.
-            robot: Name of the arm; None for the rig's first.
-            robots: Names of several arms, instead of ``robot``.
-            action: Kind of action, see :data:`ActionKind`.
-            controller: What makes the arm follow: :class:`hal.Position` by default, :class:`hal.JointImpedance` or
-                :class:`hal.OperationalSpace`. Not for torques.
-            cameras: Names of the observed cameras; None for all.
-            streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``,
-                ``segmentation`` and ``points``; None for colour and depth.
-            objects: Names of the objects of the simulated world whose poses are observed.
-            rate_hz: Steps per second.
-            max_steps: Steps after which an episode is truncated; None for no limit.
-            speeds: Greatest speeds of the tcp for ``twist`` and, per step, for ``tcp_delta``: m/s and rad/s.
-            reward: Called as ``reward(env, observation)`` after each step; None for a reward of 0.
-            terminated: Called as ``terminated(env, observation)`` after each step.
-            on_reset: Called as ``on_reset(env, options)`` after the reset and before the first observation: time for
-                the operator to arrange a real bench, or for a task to move objects with ``env.rig.world`` and
-                ``env.np_random``.
-            deadman: Makes the dead-man from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``;
-                something that really moves needs it, or ``unattended=True``.
-            unattended: Let a real arm move without a dead-man.
-            overrides: Changes of the configuration, ``key=value``.
-            render_mode: None or ``rgb_array``.
-
-        Raises:
-            CommandError: An argument is wrong, also one of the control session (see :meth:`hal.robot.Robot.control`).
-            NotSupported: The rig lacks a stream (code ``unknown_stream``) or a world (``no_world``); the arm takes no
-                controller.
-            DriverMissing: gymnasium is not installed.
-        """
-        from ..servo.controllers import Position
-
         if render_mode not in (None, "rgb_array"):
-            raise NotSupported(
-                f"render_mode {render_mode!r}: use rgb_array, the first camera's picture", code="render_mode"
-            )
-        self.render_mode = render_mode
-        for argument, names in (("cameras", cameras), ("streams", streams), ("objects", objects)):
-            if isinstance(names, str):
-                raise CommandError(f"{argument} must be a list of names: [{names!r}]", code="not_a_list")
-        functions = {"reward": reward, "terminated": terminated, "on_reset": on_reset, "deadman": deadman}
-        for argument, function in functions.items():
-            if function is not None and not callable(function):
-                raise CommandError(f"{argument} must be a function, not {function!r}", code="not_callable")
+            text = f"render_mode {render_mode!r}: use rgb_array, the first camera's picture"
+            raise NotSupported(text, code="render_mode")
+        _check_lists(cameras=cameras, streams=streams, objects=objects)
+        _check_functions(reward=reward, terminated=terminated, on_reset=on_reset, deadman=deadman)
         rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
+        self.render_mode = render_mode
         self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
         self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
         self._unattended, self._controller = unattended, controller
@@ -384,20 +388,24 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
                 self._leads, chosen, self._streams, self._objects
             )
-            # Whether a pad can be trusted is checked at the reset: it may be asleep.
-            free = unattended or self._deadman is not None
-            for arm in chosen_robots:  # checks the arguments of its session, and opens none
-                checked = arm.control(rate_hz=rate_hz, unattended=free, controller=controller)
-                if action == "torque" and checked.controller != Position():
-                    raise CommandError("action='torque' takes no controller", code="torques_by_controller")
+            self._check_sessions()
         except BaseException:
             self.rig.close()
             raise
-        self._steps = 0
-        self._due = 0.0
-        self._start = 0.0
+        self._steps, self._due, self._start = 0, 0.0, 0.0
         self.observation: Observation | None = None
         """The complete record behind the newest observation."""
+
+    def _check_sessions(self) -> None:
+        """Check the arguments of the arms' control sessions, and open none. Raises CommandError."""
+        from ..servo.controllers import Position
+
+        # Whether a pad can be trusted is checked at the reset: it may be asleep.
+        free = self._unattended or self._deadman is not None
+        for arm in self._arms:
+            checked = arm.robot.control(rate_hz=self._rate, unattended=free, controller=self._controller)
+            if self._kind == "torque" and checked.controller != Position():
+                raise CommandError("action='torque' takes no controller", code="torques_by_controller")
 
     @staticmethod
     def _open(config: str | Path | Mapping[str, Any], pads: bool, **options: Any) -> Rig:

@@ -22,6 +22,7 @@ from ..types import Trip
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from ..clock import Tick
     from ..control import Control
     from ..deadman import Deadman
     from ..rig import Rig
@@ -313,10 +314,7 @@ class PolicyRunner:
             mark = self._mark() if self._mark is not None else None
             if mark is not None:
                 return tally.end_as("success" if mark else "failure")
-            following = [name for name, control in controls.items() if control.hold_until_following()]
-            if len(following) < len(controls):
-                for name in following:
-                    _rest(controls[name])
+            if not _follow_together(controls.values()):
                 tally.count_pause()
                 begun, paused = set(), asked
                 continue
@@ -328,13 +326,7 @@ class PolicyRunner:
             seen = observation.t
             if self._success is not None and self._success(self.rig, observation):
                 return tally.end_as("success")
-            by_hand = self._takeover.command(tick.t, tick.dt) if self._takeover is not None else None
-            if by_hand is not None and self._takeover is not None:
-                for name, control in controls.items():
-                    if name == self._takeover.teleop.robot.name:
-                        control.send(by_hand[0], grip=by_hand[1])
-                    else:
-                        _rest(control)
+            if self._takeover is not None and self._drive_by_hand(self._takeover, controls, tick):
                 begun, paused = set(), asked
                 continue
             if paused:
@@ -348,6 +340,18 @@ class PolicyRunner:
                     self._send(controls[name], command, grip, first=name not in begun)
             begun |= {name for name, (command, _) in answers.items() if command is not None}
         return None
+
+    def _drive_by_hand(self, takeover: Takeover, controls: Mapping[str, Control], tick: Tick) -> bool:
+        """Send a person's command to one arm, and let the others rest; return whether a person drives."""
+        by_hand = takeover.command(tick.t, tick.dt)
+        if by_hand is None:
+            return False
+        for name, control in controls.items():
+            if name == takeover.teleop.robot.name:
+                control.send(by_hand[0], grip=by_hand[1])
+            else:
+                _rest(control)
+        return True
 
     def _send(self, control: Control, command: Command | None, grip: float | None, first: bool) -> None:
         if command is None and grip is None:
@@ -395,6 +399,16 @@ def _all_open(controls: Collection[Control]) -> Iterator[None]:
         finally:
             for control in controls:
                 control.brake()
+
+
+def _follow_together(controls: Collection[Control]) -> bool:
+    """Return whether every arm follows its commands; if not, let those that do come to rest."""
+    following = [control for control in controls if control.hold_until_following()]
+    if len(following) == len(controls):
+        return True
+    for control in following:
+        _rest(control)
+    return False
 
 
 def _rest(control: Control) -> None:
