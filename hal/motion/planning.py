@@ -332,23 +332,27 @@ def _joint_sections(points: Sequence[Array], blend: float) -> list[PathSection]:
             s.append(place + way * k / count)
 
     for k, (length, direction) in enumerate(zip(lengths, directions, strict=True)):
-        after = directions[k + 1] if k + 1 < len(directions) else None
-        cosine = float(direction @ after) if after is not None else -1.0
-        cut = min(blend, 0.5 * length, 0.5 * lengths[k + 1]) if after is not None and cosine > REVERSAL else 0.0
-        curved = after is not None and cut > _SAME and cosine < STRAIGHT_ON
-        cut = cut if curved else 0.0
+        corner, cut = kept[k + 1], _corner_cut(lengths, directions, k, blend)
         straight = length - begun - cut
         if straight > _SAME:  # knots near a corner, whose curvature must not spread over a long straight part
-            go(kept[k + 1] - cut * direction, straight, ceil(straight / (cut or begun)) if cut or begun else 1)
+            go(corner - cut * direction, straight, ceil(straight / (cut or begun)) if cut or begun else 1)
         begun = cut
-        if after is not None and curved:
+        if cut:
             place = s[-1]
             for i in range(1, _CORNER + 1):
                 u = i / _CORNER
                 done = u * u * u * (1.0 - 0.5 * u)
-                q.append(kept[k + 1] - (cut - 2.0 * cut * (u - done)) * direction + 2.0 * cut * done * after)
+                q.append(corner - (cut - 2.0 * cut * (u - done)) * direction + 2.0 * cut * done * directions[k + 1])
                 s.append(place + 2.0 * cut * u)
-        elif cosine < STRAIGHT_ON:
+        elif k + 1 == len(lengths) or float(direction @ directions[k + 1]) < STRAIGHT_ON:
             sections.append(PathSection(tuple(s), tuple(tuple(row.tolist()) for row in q)))
-            s, q = [0.0], [kept[k + 1]]
+            s, q = [0.0], [corner]
     return sections
+
+
+def _corner_cut(lengths: Floats, directions: Sequence[Array], k: int, blend: float) -> float:
+    """Return how far from the end of way ``k`` its corner with the next begins, rad; 0 if that is not rounded."""
+    if k + 1 == len(lengths):
+        return 0.0
+    cut = min(blend, 0.5 * lengths[k], 0.5 * lengths[k + 1])
+    return cut if cut > _SAME and REVERSAL < float(directions[k] @ directions[k + 1]) < STRAIGHT_ON else 0.0
