@@ -8,7 +8,7 @@ from typing import Any
 
 from ..config import load
 from ..config.data_files import list_data
-from ..config.files import nearest
+from ..config.files import suggest
 from ..geometry import Pose
 from ..kinematics.urdf import read_urdf
 from ..specs import GripperSpec, RobotSpec
@@ -240,7 +240,7 @@ def _model(
     if given in options.arms:
         model, there = options.arms[given], list_data("robots")
         if model not in there:
-            message = f"--arm {given}={model}: there is no such model{nearest(model, there)}"
+            message = f"--arm {given}={model}: there is no such model{suggest(model, there)}"
             raise reading.wrong(node, message, "unknown_model")
         return model, "from --arm"
     joints = set(urdf.model.joints) if urdf is not None else set()

@@ -14,7 +14,7 @@ import yaml
 
 from ..config import load
 from ..config.data_files import data_folder
-from ..config.files import nearest, parse_yaml
+from ..config.files import parse_yaml, suggest
 from ..config.rigfile import RigFile
 from ..config.schema import PoseConfig
 from ..errors import CommandError
@@ -148,7 +148,7 @@ def _choose(kind: str, name: str | None, specs: Mapping[str, Spec]) -> Spec:
             return next(iter(specs.values()))
         raise CommandError(f"--{kind} is needed; this rig has: {', '.join(specs) or 'none'}", code=f"missing_{kind}")
     if name not in specs:
-        raise CommandError(f"this rig has no {kind} {name!r}{nearest(name, specs)}", code=f"unknown_{kind}")
+        raise CommandError(f"this rig has no {kind} {name!r}{suggest(name, specs)}", code=f"unknown_{kind}")
     return specs[name]
 
 
@@ -156,7 +156,7 @@ def _check_link(arm: RobotSpec, link: str) -> None:
     """Raise CommandError unless the link exists and moves with the arm's joints alone."""
     urdf = read_urdf(Path(arm.urdf))
     if link not in urdf.links:
-        raise CommandError(f"robot {arm.name!r} has no link {link!r}{nearest(link, urdf.links)}", code="unknown_link")
+        raise CommandError(f"robot {arm.name!r} has no link {link!r}{suggest(link, urdf.links)}", code="unknown_link")
     others = [joint.name for joint in urdf.above(link) if joint.movable and joint.name not in arm.joints]
     if others:
         raise CommandError(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
-from ..config.files import Problems, nearest, validate
+from ..config.files import Problems, suggest, validate
 from ..config.schema import Strict, ValueProblem
 from ..types import AXES, BUTTONS
 from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
@@ -90,7 +90,7 @@ class Identity(NamedTuple):
 def _known(kind: str, names: Collection[str]) -> AfterValidator:
     def check(name: str) -> str:
         if name not in names:
-            raise ValueProblem(f"{name!r} is not a known {kind}{nearest(name, names)}", "unknown_control")
+            raise ValueProblem(f"{name!r} is not a known {kind}{suggest(name, names)}", "unknown_control")
         return name
 
     return AfterValidator(check)
