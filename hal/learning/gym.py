@@ -86,7 +86,7 @@ def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, spee
             low += robot.limits.lower
             high += robot.limits.upper
         elif kind in ("velocity", "torque"):
-            most = _greatest(robot, kind)
+            most = _find_limits(robot, kind)
             low += [-value for value in most]
             high += most
         elif kind in ("tcp_delta", "twist"):
@@ -103,7 +103,7 @@ def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, spee
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
-def _greatest(robot: Robot, kind: ActionKind) -> list[float]:
+def _find_limits(robot: Robot, kind: ActionKind) -> list[float]:
     """Return the greatest joint velocities of a session (n,), rad/s, or the greatest torques (n,), Nm."""
     if kind == "velocity":
         return [robot.spec.speed * value for value in robot.limits.velocity]
@@ -142,17 +142,17 @@ def observation_space(
         CommandError: Two entries would have the same key (code ``duplicate_name``).
     """
 
-    def free(size: int) -> spaces.Box:
+    def make_box(size: int) -> spaces.Box:
         return spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
     parts: list[tuple[str, spaces.Space[Any]]] = []
     for lead, robot in robots.items():
         sizes = {"q": robot.n, "dq": robot.n, "tcp": 7} | ({"gripper": 1} if robot.gripper is not None else {})
-        parts += [(lead + name, free(size)) for name, size in sizes.items()]
+        parts += [(lead + name, make_box(size)) for name, size in sizes.items()]
     for camera in cameras:
-        found = [stream for stream in streams if stream in _offered(camera.spec)]
+        found = [stream for stream in streams if stream in _list_streams(camera.spec)]
         parts += [(entry_key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
-    parts += [(entry_key("object", name), free(7)) for name in objects]
+    parts += [(entry_key("object", name), make_box(7)) for name in objects]
     keys = [name for name, _ in parts]
     if twice := sorted({name for name in keys if keys.count(name) > 1}):
         raise CommandError(
@@ -201,7 +201,7 @@ def numbers_and_pictures(
     return shown
 
 
-def _offered(camera: CameraSpec) -> tuple[str, ...]:
+def _list_streams(camera: CameraSpec) -> tuple[str, ...]:
     """Return the streams of a camera that can be observed: its own, and points where it has depth."""
     return (*camera.streams, POINTS) if "depth" in camera.streams else tuple(camera.streams)
 
@@ -372,7 +372,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self._unattended, self._controller = unattended, controller
         self.rig = self._open(config, deadman is not None, sim=sim, driver=driver, engine=engine, overrides=overrides)
         try:
-            chosen_robots = _chosen(self.rig, robot, robots)
+            chosen_robots = _choose_robots(self.rig, robot, robots)
             self.robot: Robot = chosen_robots[0]
             """The arm; the first of several."""
             self._arms = tuple(_EnvArm(arm, action) for arm in chosen_robots)
@@ -381,9 +381,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             """Name of each number of an action; with ``robots`` after the arm's name, as in recordings."""
             self._deadman = deadman(self.rig) if deadman is not None else None
             self._cameras = tuple(self.rig.cameras) if cameras is None else tuple(cameras)
-            self._objects = _known(objects, self.rig)
+            self._objects = _check_objects(objects, self.rig)
             chosen = [self.rig.cameras[name] for name in self._cameras]
-            self._streams = ("color", "depth") if streams is None else _streamed(streams, chosen)
+            self._streams = ("color", "depth") if streams is None else _check_streams(streams, chosen)
             self.action_space: Box = action_space(chosen_robots, action, rate_hz, speeds)  # type: ignore[assignment]
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
                 self._leads, chosen, self._streams, self._objects
@@ -515,7 +515,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         now = clock.now()
         self._due = max(self._due + 1.0 / self._rate, now)  # a late turn is not caught up
         clock.sleep_until(self._due)
-        observation = self.rig.observe(after=self._fresh_from(now), cameras=self._cameras)
+        observation = self.rig.observe(after=self._find_oldest(now), cameras=self._cameras)
         self._steps += 1
         terminated = self._terminated is not None and bool(self._terminated(self, observation))
         truncated = bool(stopped) or (self._max_steps is not None and self._steps >= self._max_steps)
@@ -525,7 +525,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward = float(self._reward(self, observation)) if self._reward is not None else 0.0
         return self._observation_dict(observation), reward, terminated, truncated, info
 
-    def _fresh_from(self, sent: float) -> float | None:
+    def _find_oldest(self, sent: float) -> float | None:
         """Return the oldest time of an acceptable picture, s; None in lock-step, where all show the present.
 
         It is after the action, and as new as the rate of the slowest camera allows.
@@ -562,7 +562,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             self.rig.close()
 
 
-def _chosen(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[Robot]:
+def _choose_robots(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[Robot]:
     """Return the arms of an environment. Raises CommandError if both arguments are given, or a name twice."""
     if robots is None:
         return [rig.robots[robot] if robot else next(iter(rig.robots.values()))]
@@ -571,7 +571,7 @@ def _chosen(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[R
     return [rig.robots[name] for name in robots]
 
 
-def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
+def _check_objects(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
     """Return the names of objects whose poses can be observed. Raises NotSupported or DeviceNotFound."""
     if not objects:
         return ()
@@ -580,9 +580,9 @@ def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
     return tuple(rig.world.poses(objects).poses)
 
 
-def _streamed(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
+def _check_streams(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
     """Return the observed streams. Raises NotSupported for one that none of the cameras has."""
-    there = {stream for camera in cameras for stream in _offered(camera.spec)}
+    there = {stream for camera in cameras for stream in _list_streams(camera.spec)}
     if missing := [stream for stream in streams if stream not in there]:
         message = (
             f"streams=: no observed camera has {', '.join(missing)}; they have: {', '.join(sorted(there)) or 'none'}"

@@ -261,7 +261,7 @@ class PolicyRunner:
         that is not a command (code ``bad_answer``).
         """
         self._reset(None)
-        self._parts(getattr(self.policy, "rehearse", self.policy)(self._observe()))
+        self._split_answers(getattr(self.policy, "rehearse", self.policy)(self._observe()))
 
     def run(self, seed: int | None = None, on_turn: Callable[[float], None] = lambda seconds: None) -> PolicyOutcome:
         """Run one episode from the arms' present positions; they are at rest afterwards.
@@ -278,11 +278,11 @@ class PolicyRunner:
         controls = {name: robot.control(**self._terms) for name, robot in self.robots.items()}
         stopped: list[str] = []
         try:
-            with _policy_errors(PolicyError):
+            with _mark_errors(PolicyError):
                 self._reset(seed)
             if self._takeover is not None:
                 self._takeover.reset()
-            with _all_open(controls.values()):
+            with _open_all(controls.values()):
                 try:
                     self._drive(controls, tally, on_turn)
                 except (MotionStopped, RobotFault):
@@ -335,7 +335,7 @@ class PolicyRunner:
             for name in controls.keys() - begun:
                 controls[name].hold_for(FIRST_ANSWER)
             answers = self._answer(observation, tally)
-            with _policy_errors((CommandError, PolicyError)):
+            with _mark_errors((CommandError, PolicyError)):
                 for name, (command, grip) in answers.items():
                     self._send(controls[name], command, grip, first=name not in begun)
             begun |= {name for name, (command, _) in answers.items() if command is not None}
@@ -365,12 +365,12 @@ class PolicyRunner:
 
     def _answer(self, observation: Observation, tally: _Tally) -> dict[str, tuple[Command | None, float | None]]:
         start = time.perf_counter()
-        with _policy_errors(Exception):
-            answers = self._parts(self.policy(observation))
+        with _mark_errors(Exception):
+            answers = self._split_answers(self.policy(observation))
         tally.inference.add(time.perf_counter() - start)
         return answers
 
-    def _parts(self, answer: Any) -> dict[str, tuple[Command | None, float | None]]:
+    def _split_answers(self, answer: Any) -> dict[str, tuple[Command | None, float | None]]:
         """Return command and grip for each arm. Raises CommandError for anything else (code ``bad_answer``)."""
         if not isinstance(answer, Mapping):
             if len(self.robots) > 1 and answer is not None:
@@ -385,11 +385,11 @@ class PolicyRunner:
                 f"the policy answers for {', '.join(sorted(map(str, unknown)))}; it moves {', '.join(self.robots)}",
                 code="bad_answer",
             )
-        return {name: _parts(part) for name, part in answer.items()}
+        return {name: _split_answer(part) for name, part in answer.items()}
 
 
 @contextlib.contextmanager
-def _all_open(controls: Collection[Control]) -> Iterator[None]:
+def _open_all(controls: Collection[Control]) -> Iterator[None]:
     """Open every arm's session; at the end all brake at once, and each is closed whatever happens to the others."""
     with contextlib.ExitStack() as closing:
         for control in controls:
@@ -421,7 +421,7 @@ class _PolicyError(Exception):
 
 
 @contextlib.contextmanager
-def _policy_errors(kind: type[Exception] | tuple[type[Exception], ...]) -> Iterator[None]:
+def _mark_errors(kind: type[Exception] | tuple[type[Exception], ...]) -> Iterator[None]:
     """Raise errors of this kind, or of these, as a :class:`_PolicyError`."""
     try:
         yield
@@ -473,7 +473,7 @@ class _Tally:
         )
 
 
-def _parts(answer: Any) -> tuple[Command | None, float | None]:
+def _split_answer(answer: Any) -> tuple[Command | None, float | None]:
     """Return command and grip of a policy's answer for one arm. Raises CommandError for anything else."""
     command, grip = answer, None
     if isinstance(answer, tuple):
