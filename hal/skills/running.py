@@ -281,7 +281,7 @@ class SkillRun:
 
         planner = PathPlanner(self.arm.kinematics, self.arm.limits.lower, self.arm.limits.upper)
         try:
-            planner.along_poses(q.tolist(), [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in way])
+            planner.plan_poses(q.tolist(), [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in way])
         except (Unreachable, CommandError):
             return False
         return True
