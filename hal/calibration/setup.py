@@ -193,9 +193,9 @@ class RigFileOutput:
         self.source, self.path, self.camera = source, path, camera
         if not self.path.resolve().parent.is_dir():
             raise CommandError(f"there is no folder {self.path.resolve().parent}", code="no_folder")
-        self._changed("pose", "[0, 0, 0, 0, 0, 0, 1]")
+        self._replace_place("pose", "[0, 0, 0, 0, 0, 0, 1]")
 
-    def _changed(self, key: str, value: str) -> str:
+    def _replace_place(self, key: str, value: str) -> str:
         return replace_camera_place(self.source.read_bytes().decode("utf-8"), self.camera, key, value)
 
     def write(self, key: str, value: str) -> list[str]:
@@ -208,7 +208,7 @@ class RigFileOutput:
             ConfigError: The new file would not be a valid rig; nothing is changed.
             OSError: The file cannot be written; nothing is changed.
         """
-        text = self._changed(key, value)
+        text = self._replace_place(key, value)
         trial = self.path.resolve().with_name(f".{self.path.name}.trial.yaml")
         try:
             write_file(trial, text)
@@ -244,8 +244,8 @@ def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
     entry = f"{key}: {value}"
     by_hand = f"edit cameras.{camera} by hand: replace {', '.join(PLACES)} with\n  {entry}"
     try:
-        changed = _edited(text, camera, entry)
-        fits = parse_yaml(changed) == _expected(parse_yaml(text), camera, key, value)
+        changed = _edit_text(text, camera, entry)
+        fits = parse_yaml(changed) == _change_data(parse_yaml(text), camera, key, value)
     except (yaml.YAMLError, LookupError, TypeError) as error:
         raise CommandError(f"the file cannot be edited ({error}); {by_hand}", code="not_editable") from None
     if not fits:
@@ -255,14 +255,14 @@ def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
     return changed
 
 
-def _expected(data: Any, camera: str, key: str, value: str) -> Any:
+def _change_data(data: Any, camera: str, key: str, value: str) -> Any:
     """The file's data after the change."""
     entries = {name: item for name, item in data["cameras"][camera].items() if name not in PLACES}
     entries[key] = parse_yaml(value)
     return {**data, "cameras": {**data["cameras"], camera: entries}}
 
 
-def _edited(text: str, camera: str, entry: str) -> str:
+def _edit_text(text: str, camera: str, entry: str) -> str:
     """The new text. Raises LookupError and TypeError if the file has another structure than expected."""
     root = yaml.compose(text, Loader=yaml.SafeLoader)  # in Python, since libyaml's counts bytes
     settings = _value(_value(root, "cameras"), camera)
