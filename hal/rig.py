@@ -21,7 +21,7 @@ from .commands import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
-from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, groups_of
+from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups
 from .host.process import SharedMemory
 from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad
@@ -145,7 +145,7 @@ class Rig:
     def _open(self, *, pad: str | None, viewer: str, console: bool, listen: Listen, realtime: bool) -> None:
         plan = self.plan
         pads = check_opening(plan, pad, viewer, console)
-        groups = groups_of(plan)
+        groups = make_groups(plan)
         world_host = self._start_hosts(groups, realtime)
         if console or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)

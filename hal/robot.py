@@ -212,7 +212,7 @@ class Robot:
         The last second is kept: in real time one state per cycle, in lock-step one per wait of the program.
         """
         self._host.check()
-        return self._mail.history.since(after)
+        return self._mail.history.read_since(after)
 
     def check(self) -> None:
         """Raise ConnectionLost if the process that owns the arm is gone; the arm cannot come back then."""
