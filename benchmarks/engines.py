@@ -45,7 +45,7 @@ from referee_kit import TOUR, draw_state, drive_tour
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 from pick import above, grasp_pose
 
-ENGINES = [name for name in registry.ENGINES if not registry.missing(name)]
+ENGINES = [name for name in registry.ENGINES if not registry.find_missing(name)]
 APART, TURNED = 0.002, 0.01
 """Goal for the ends of the tour, m and rad."""
 REAL_TIME_HZ = 200

@@ -75,7 +75,7 @@ def run(engine: str, rate_hz: float, seconds: float, cameras: bool, realtime: bo
                 state = arm.state(max_age=1.0)
                 ages.add(rig.clock.now() - state.stamp.t)
                 for camera in rig.cameras.values():
-                    camera.latest(max_age=5.0)
+                    camera.read_latest(max_age=5.0)
                 if turn > seconds:
                     break
         after = next(iter(rig.statistics().values()))

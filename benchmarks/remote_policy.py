@@ -194,7 +194,7 @@ def takeovers(count: int, clock: str) -> None:
 
         ended = threading.Event()
         if rig.lock_step:
-            rig.clock.every(1.0 / 240.0, watch)
+            rig.clock.call_every(1.0 / 240.0, watch)
         else:
 
             def watch_always() -> None:

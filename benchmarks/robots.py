@@ -27,7 +27,7 @@ from hal.config.files import read_yaml
 from hal.errors import ConfigError, Unreachable
 from hal.types import Trip
 
-ENGINES = [name for name in registry.ENGINES if not registry.missing(name)]
+ENGINES = [name for name in registry.ENGINES if not registry.find_missing(name)]
 TOUR = str(find_data("config", "teleop/tour.jsonl"))
 RATE_HZ = 50
 
