@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
-from hal.registry import EngineChoice
+from hal.registry import ENGINES
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
@@ -64,8 +64,9 @@ def add_config_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGro
     flag.add_argument("--real", dest="sim", action="store_false", help="use the real devices")
     rig.add_argument(
         "--engine",
-        choices=get_args(EngineChoice),
-        help="engine of the simulation (default: the rig's; auto: the first of these that is installed)",
+        metavar="NAME",
+        help=f"engine of the simulation: {', '.join(ENGINES)}, auto (the first of these that is installed), or a "
+        "driver with a world (default: the rig's)",
     )
     rig.add_argument(
         "--set",
