@@ -158,8 +158,8 @@ def _main(args: argparse.Namespace) -> int:
         except BaseException:
             line.clear()
             if args.upload or any(parts_folder(args.out).glob("*/meta/info.json")):
-                where = args.upload or parts_folder(args.out)
-                print(f"  finished episodes are in {where}; the same command continues", flush=True)
+                place = args.upload or parts_folder(args.out)
+                print(f"  finished episodes are in {place}; the same command continues", flush=True)
             raise
     line.clear()
     _print_results(args, made)

@@ -53,7 +53,7 @@ def _open_address(address: str) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:
-        raise DriverMissing("fsspec is not installed: pip install fsspec", name="fsspec") from error
+        raise DriverMissing("fsspec is not installed: pip install 'robot-hal[ray]'", name="fsspec") from error
     try:
         system, path = url_to_fs(address)
     except ImportError as error:  # such as "Install s3fs to access S3"
