@@ -83,9 +83,9 @@ def test_what_a_person_recorded_is_replayed(tmp_path: Path, engine: str) -> None
 @ENGINES
 def test_an_episode_with_a_takeover_is_replayed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str) -> None:
     monkeypatch.syspath_prepend(Path(__file__).parents[2])
-    pad = write_pad(tmp_path, (2.0, "BTN_TL"), (4.0, "BTN_TL"), until=15.0, held=(0.5, 14.0))
+    pad = write_pad(tmp_path, (2.0, "BTN_TL"), (4.0, "BTN_TL"), until=25.0, held=(0.5, 24.0))
     policy = ["--policy", "demonstrations:Picker", "--success", f"demonstrations:{is_lifted.__name__}"]
-    options = [*policy, *BARE, "--set", "simulation.clock=lock_step", "--engine", engine, "--seconds", "12"]
+    options = [*policy, *BARE, "--set", "simulation.clock=lock_step", "--engine", engine, "--seconds", "20"]
     seeds = range(500, 520 if SOAK else 501)
     for seed in seeds:
         rollout.main([*options, "--takeover", "--pad", pad, "--seed", str(seed), "--out", str(tmp_path / "out")])

@@ -145,7 +145,7 @@ from pick import pick as picked
 def pick(rig, random):
     node = Path(tempfile.gettempdir())
     with open(os.environ["WATCH"], "a") as file:
-        file.write(f"{node.name} {os.environ['CUDA_VISIBLE_DEVICES']} {len(list(node.iterdir()))}\\n")
+        file.write(f"{node.name} {os.environ['CUDA_VISIBLE_DEVICES']} {len(list(node.iterdir()))} {__file__}\\n")
     return picked(rig, random)
 """
 
@@ -177,14 +177,15 @@ def test_nodes_without_a_shared_folder_upload_what_they_make(nodes: str, tmp_pat
     program.mkdir(), out.parent.mkdir()
     (program / "pick.py").write_bytes((ROOT / "examples" / "pick.py").read_bytes())
     (program / "watched.py").write_text(WATCHED)
-    (program / "environment.yaml").write_text(f"env_vars: {{WATCH: {watch}}}\n")
+    (program / "environment.yaml").write_text(f"working_dir: .\nenv_vars: {{WATCH: {watch}}}\n")
     options = ["--workers", "3", "--ray", nodes, "--gpus", "0.5", "--runtime-env", "environment.yaml"]
     run = command(out, *options, "--upload", (tmp_path / "bucket").as_uri(), "--skill", "watched:pick")
     done = subprocess.run(run, cwd=program, capture_output=True, text=True, timeout=200.0)
     assert done.returncode == 0, done.stdout + done.stderr
     found = [line.split() for line in watch.read_text().splitlines()]
-    assert {place for place, _, _ in found} == {"node_0", "node_1"}
-    assert {cards for _, cards, _ in found} <= {"0", "1"}
-    assert {files for _, _, files in found} == {"1"}, "the temporary folder of the one worker that has room there"
+    assert {place for place, *_ in found} == {"node_0", "node_1"}
+    assert {cards for _, cards, *_ in found} <= {"0", "1"}
+    assert {files for _, _, files, _ in found} == {"1"}, "the temporary folder of the one worker that has room there"
+    assert not any(Path(module).is_relative_to(program) for *_, module in found), "each node has a copy"
     check_same(out, expected)
     assert not any(path.is_file() for name in ("node_0", "node_1", "bucket") for path in (tmp_path / name).rglob("*"))
