@@ -142,12 +142,13 @@ class Regression:
 
 
 class ServedRegression:
-    """The same on a server: chunks of steps of the tcp, each from where the one before is expected to lead."""
+    """The same on a server: chunks of steps of the tcp, a row of the recording each, which the regression predicts."""
 
-    STEPS = 6
+    LENGTH = 30
+    """Rows of a chunk."""
     CONFIG: ClassVar[dict[str, Any]] = {
-        "rate_hz": 30 / AHEAD,
-        "execute": 2,
+        "rate_hz": 30,
+        "execute": AHEAD,
         "observation": {
             "tcp": {"state": ["tcp_position", "tcp_quaternion"]},
             "width": {"state": "width"},
@@ -168,11 +169,12 @@ class ServedRegression:
             self.cube = self.base.inverse() @ pose_of(request["cube"])
         tcp, steps = pose_of(request["tcp"]), []
         near = features(self.cube.inverse() @ tcp, float(request["width"][0]))
-        for _ in range(self.STEPS):
+        for _ in range(self.LENGTH // AHEAD):
             x, y, z, cosine, sine, width = near = self.kernel(near)
             after = self.cube @ Pose.from_rpy((x, y, z), (np.pi, 0.0, np.arctan2(sine, cosine)))
             turn = np.arctan2(*after.matrix()[[1, 0], 0]) - np.arctan2(*tcp.matrix()[[1, 0], 0])
             turn = (turn + np.pi) % (2 * np.pi) - np.pi
-            steps.append([*(after.position - tcp.position), 0.0, 0.0, turn, width])
+            move = np.array([*(after.position - tcp.position), 0.0, 0.0, turn])
+            steps += [[*(move / AHEAD), width]] * AHEAD
             tcp = after
         return {"actions": np.array(steps, np.float32)}
