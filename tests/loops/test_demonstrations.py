@@ -27,6 +27,7 @@ from hal.learning.replay import RecordedTrajectory, TrajectoryPlayer
 from hal.recording import Dataset, Episode
 
 SOAK = os.environ.get("HAL_SOAK") == "1"
+pytestmark = pytest.mark.timeout(1200 if SOAK else 120)
 ENGINES = pytest.mark.parametrize("engine", ["pybullet", "mujoco"] if SOAK else ["mujoco"])
 _PAIRS = list(
     itertools.product(
