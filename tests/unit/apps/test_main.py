@@ -11,7 +11,7 @@ from app_kit import run_here
 from engines_kit import AUTO
 
 from hal.apps import dataset, teleop
-from hal.apps.main import PROGRAMS, main
+from hal.apps.main import BESIDE, PROGRAMS, main
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -41,7 +41,6 @@ def test_a_program_gets_its_own_options(name: str, capsys: pytest.CaptureFixture
     ("command", "words", "usage"),
     [
         ("/usr/bin/hal", ["collect"], "hal collect"),
-        ("/usr/bin/hal", ["import-ark"], "hal import-ark"),
         ("/usr/bin/hal", ["calibrate", "board"], "hal calibrate board"),
         ("/usr/bin/hal", ["dataset", "split"], "hal dataset split"),
         ("/usr/bin/hal", [], "hal"),
@@ -90,8 +89,44 @@ def test_schema_and_version() -> None:
     assert run_here(main, "--version").stdout.startswith("robot-hal ")
 
 
-def test_a_mistake_is_a_message() -> None:
-    for words in (["teleopp"], ["list", "robot"]):
-        with pytest.raises(SystemExit) as done:
-            main(words)
-        assert done.value.code == 2
+@pytest.mark.parametrize(
+    ("words", "text"), [(["teleopp"], "did you mean 'teleop'?"), (["list", "robot"], "kinds: robots, ")]
+)
+def test_a_mistake_is_a_message(words: list[str], text: str) -> None:
+    done = run_here(main, *words)
+    assert done.returncode == 2
+    assert text in done.stderr
+
+
+PACKAGE = """
+from hal.errors import CommandError
+
+def main(arguments):
+    if arguments == ["--wrong"]:
+        raise CommandError("--wrong is wrong")
+    print("there:", *arguments)
+    return 7
+"""
+
+
+def test_an_installed_package_adds_a_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "far_away.py").write_text(PACKAGE)
+    metadata = tmp_path / "far_away-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: far-away\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[hal.apps]\nfar-away = far_away:main\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run_here(main, "far-away", "--here", "x") == (7, "there: --here x\n", "")
+    done = run_here(main, "far-away", "--wrong")
+    assert (done.returncode, done.stderr) == (2, "CommandError: --wrong is wrong\n")
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_without_its_package_a_program_says_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: ())
+    done = run_here(main, name, "--help")
+    folder = BESIDE[name][1]
+    assert (ROOT / folder / "pyproject.toml").is_file()
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"pip install -e {folder}" in line

@@ -12,7 +12,8 @@ from typing import Any, Literal, get_args
 
 import yaml
 
-from ..config.schema import describe
+from hal.config.schema import describe
+
 from .reading import PACKAGE, ArkNode, PackageFile
 
 __all__ = [

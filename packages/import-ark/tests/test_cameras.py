@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
+from hal_import_ark import ArkOptions
 
-from hal.ark import ArkOptions
 from hal.config import load
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..config import load
-from ..config.data_files import list_data
-from ..config.files import nearest
-from ..geometry import Pose
-from ..kinematics.urdf import read_urdf
-from ..specs import GripperSpec, RobotSpec
+from hal.config import load
+from hal.config.data_files import list_data
+from hal.config.files import nearest
+from hal.geometry import Pose
+from hal.kinematics.urdf import read_urdf
+from hal.specs import GripperSpec, RobotSpec
+
 from .arm_model import ArkUrdf, ArmModel, arm_model
 from .entries import ArkItem, ArkOptions, ImportState, position_of, rotation_of
 from .output import Commented, Inline, KeyReport, Remark, plain

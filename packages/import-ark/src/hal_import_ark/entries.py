@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..geometry import matrix_to_quaternion, rpy_to_matrix
+from hal.geometry import matrix_to_quaternion, rpy_to_matrix
+
 from .output import Commented, KeyReport
 from .reading import ArkNode, ArkReader, FileFinder, InvalidValue
 

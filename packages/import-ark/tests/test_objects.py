@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from ark_kit import BALL, DATA, PANDA, changed, imported, row, write
-from errors_kit import raises_problems
+from ark_kit import BALL, DATA, PANDA, changed, imported, raises_problems, row, write
+from hal_import_ark import ArkOptions, import_ark
 
 import hal
-from hal.ark import ArkOptions, import_ark
 from hal.geometry import Pose
 
 MUG = DATA / "tutorial" / "config" / "objects" / "mug" / "model.urdf"

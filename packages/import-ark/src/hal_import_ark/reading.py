@@ -9,10 +9,10 @@ from typing import Any
 
 import yaml
 
-from ..config.files import PlacedErrors, Problems, check_size, nearest
-from ..config.schema import describe, is_number
-from ..errors import ConfigError
-from ..kinematics.mesh_files import package_folder
+from hal.config.files import PlacedErrors, Problems, check_size, nearest
+from hal.config.schema import describe, is_number
+from hal.errors import ConfigError
+from hal.kinematics.mesh_files import package_folder
 
 __all__ = [
     "ArkNode",

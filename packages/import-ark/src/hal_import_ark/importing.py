@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..config import load
-from ..config.data_files import list_data
-from ..config.files import nearest
-from ..errors import CommandError, ConfigError, Problem
+from hal.config import load
+from hal.config.data_files import list_data
+from hal.config.files import nearest
+from hal.errors import CommandError, ConfigError, Problem
+
 from .arm_model import ArmModel
 from .entries import ArkOptions, ImportState
 from .output import Commented, Inline, KeyReport, KeyRow, Remark, yaml_text

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
-from errors_kit import raises_problems
+from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, raises_problems, row
+from hal_import_ark import ArkOptions
+from hal_import_ark.arm_model import ArkUrdf
 
 import hal
-from hal.ark import ArkOptions
-from hal.ark.arm_model import ArkUrdf
 from hal.config import load
 from hal.config.files import parse_yaml
 from hal.geometry import Pose

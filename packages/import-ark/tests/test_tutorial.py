@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import yaml
 from ark_kit import BALL, CAMERA, DATA, PANDA, PANDA_URDF, TUTORIAL, changed, imported, leaves, row, write
+from hal_import_ark import ArkOptions, Imported, import_ark
+from hal_import_ark.output import summary, table
+from hal_import_ark.reading import ArkReader
 
 import hal
-from hal.ark import ArkOptions, Imported, import_ark
-from hal.ark.output import summary, table
-from hal.ark.reading import ArkReader
 from hal.config import load
 from hal.config.data_files import list_data
 from hal.geometry import Pose

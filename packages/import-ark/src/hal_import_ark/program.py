@@ -1,30 +1,30 @@
-"""Import Ark's configuration files as a rig's file, with a report of every key.
+"""The program ``hal import-ark``: converts Ark's configuration files to a rig's file, with a report of every key.
 
-python apps/import_ark.py global_config.yaml -o config/mine.yaml
-python apps/import_ark.py global_config.yaml --check
+hal import-ark global_config.yaml -o config/mine.yaml
+hal import-ark global_config.yaml --check
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app
+from hal.config import load
+from hal.errors import CommandError
 
-if TYPE_CHECKING:
-    from hal.ark import ArkOptions, Imported
+from .entries import ArkOptions
+from .importing import Imported, import_ark
+from .output import summary, table
 
 __all__ = ["main", "parser"]
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of ``import-ark``."""
+    """Return the command line."""
     made = argparse.ArgumentParser(
-        prog="import-ark",
+        prog="hal import-ark",
         description="Convert Ark's configuration files to a rig file, with a report of every key.",
         epilog="Ark's files are only read. On an error nothing is written and the exit status is 2.",
     )
@@ -59,15 +59,13 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the program; return its exit status."""
-    return run_app(_main, parser(), argv)
+def main(argv: list[str]) -> int:
+    """Run the program; return its exit status.
 
-
-def _main(args: argparse.Namespace) -> int:
-    from hal.ark import import_ark
-    from hal.errors import CommandError
-
+    Raises:
+        HalError: An option or a file is wrong; ``hal`` prints it as a message.
+    """
+    args = parser().parse_args(argv)
     if args.out is not None:
         if args.out.suffix not in (".yaml", ".yml"):
             raise CommandError(f"-o {args.out}: a rig's file ends in .yaml")
@@ -83,15 +81,17 @@ def _main(args: argparse.Namespace) -> int:
     if path is None:
         print("\nvalid; nothing is written (--check)")
         return 0
-    _write(texts, path)
-    program = "python apps/teleop.py" if sys.argv[0].endswith(".py") else "hal-teleop"
-    print(f"\nstart: {program} --sim --config {args.out}")
+    print()
+    for file, text in texts.items():
+        _write(file, text)
+        print(f"written: {file}")
+    for warning in load(path).resolve().warnings:
+        print(f"  note     {warning}")
+    print(f"\nstart: hal teleop --sim --config {args.out}")
     return 0
 
 
 def _options(args: argparse.Namespace) -> ArkOptions:
-    from hal.ark import ArkOptions
-
     return ArkOptions(
         start=args.start,
         arms=_pairs("--arm", args.arm),
@@ -102,8 +102,6 @@ def _options(args: argparse.Namespace) -> ArkOptions:
 
 
 def _pairs(option: str, given: Sequence[str]) -> dict[str, str]:
-    from hal.errors import CommandError
-
     pairs = {}
     for text in given:
         name, equals, value = text.partition("=")
@@ -114,8 +112,6 @@ def _pairs(option: str, given: Sequence[str]) -> dict[str, str]:
 
 
 def _report(imported: Imported) -> list[str]:
-    from hal.ark.output import summary, table
-
     width = max(100, min(160, shutil.get_terminal_size((120, 24)).columns))
     lines = [*table(imported.rows, imported.source.parent, width), "", summary(imported.rows)]
     if imported.left_out:
@@ -126,19 +122,7 @@ def _report(imported: Imported) -> list[str]:
     return lines
 
 
-def _write(texts: dict[Path, str], path: Path) -> None:
-    """Write the rig's file ``path`` and the others, and list the rig's devices."""
-    from hal.apps._display import list_devices
-    from hal.config import load
-
-    for file, text in texts.items():
-        _put(file, text)
-    plan = load(path).resolve()
-    lines = [*list_devices(plan), *(f"note     {warning}" for warning in plan.warnings)]
-    print("\n".join(["", *(f"written: {file}" for file in texts), *(f"  {line}" for line in lines)]))
-
-
-def _put(path: Path, text: str) -> None:
+def _write(path: Path, text: str) -> None:
     """Write a file completely or not at all."""
     temporary = path.with_name(f".{path.name}.new")
     try:
@@ -146,7 +130,3 @@ def _put(path: Path, text: str) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,9 +6,10 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from ..config.schema import describe
-from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
-from ..registry import ENGINES
+from hal.config.schema import describe
+from hal.geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
+from hal.registry import ENGINES
+
 from .entries import ArkItem, ImportState, position_of, rotation_of, tidy
 from .output import Commented, Inline, KeyReport, Remark
 from .reading import ArkNode, ArkReader, InvalidValue

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..geometry import Pose
-from ..kinematics.urdf import UrdfJoint, read_urdf
-from ..registry import SIMULATION
+from hal.geometry import Pose
+from hal.kinematics.urdf import UrdfJoint, read_urdf
+from hal.registry import SIMULATION
+
 from .output import Commented, Inline, KeyReport, Remark
 from .reading import ArkNode, ArkReader
 

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import yaml
 from ark_kit import BALL, CAMERA, DATA, PANDA, TUTORIAL, changed, write
+from hal_import_ark import import_ark
 
 from hal import ConfigError
-from hal.ark import import_ark
 from hal.errors import Problem
 
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
+from hal_import_ark import ArkOptions, Imported, import_ark
+from hal_import_ark.reading import ArkNode
 
-from hal.ark import ArkOptions, Imported, import_ark
-from hal.ark.reading import ArkNode
 from hal.config.files import parse_yaml
+from hal.errors import ConfigError
 
-DATA = Path(__file__).resolve().parents[1] / "data" / "ark"
+DATA = Path(__file__).resolve().parent / "data"
 TUTORIAL = DATA / "tutorial" / "config" / "global_config.yaml"
 PANDA_URDF = DATA / "franka_panda" / "panda_with_gripper.urdf"
 
@@ -96,3 +99,11 @@ def leaves(node: ArkNode, above: tuple[ArkNode, ...] = ()) -> Iterator[tuple[Ark
         yield path
     for child in node.children.values():
         yield from leaves(child, path)
+
+
+@contextmanager
+def raises_problems(*codes: str) -> Iterator[None]:
+    """Fail unless the block raises a ConfigError with problems of these codes, in their order."""
+    with pytest.raises(ConfigError) as caught:
+        yield
+    assert tuple(problem.code for problem in caught.value.problems) == codes
