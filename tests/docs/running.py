@@ -159,7 +159,7 @@ class Reader:
         if words[0] == "hal-check":
             return ["-m", "hal.apps.check", *words[1:]]
         if words[0] == "python" and not words[1].startswith("-"):
-            return [str(ROOT / words[1]) if words[1].startswith(("apps/", "benchmarks/")) else words[1], *words[2:]]
+            return [str(ROOT / words[1]) if words[1].startswith("apps/") else words[1], *words[2:]]
         return None
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
 """Draw every built-in model of an arm into docs/images/robots/NAME.png, with the simulation's own renderer.
 
-    python benchmarks/robot_pictures.py [MODEL ...]
+    python docs/robot_pictures.py [MODEL ...]
 
 Models whose package is not installed are left out. The pictures have a palette of 64 colours, to be small.
 """
@@ -8,6 +8,7 @@ Models whose package is not installed are left out. The pictures have a palette 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ from PIL import Image
 import hal
 from hal.config.data_files import list_data
 from hal.errors import ConfigError
-from robots import entries
 
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "images" / "robots"
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from benchmarks.robots import entries
+
+FOLDER = Path(__file__).resolve().parent / "images" / "robots"
 SIZE, SHARP, COLORS = 260, 3, 64
 """Side of a picture, pixels; it is drawn larger by a factor and then scaled down; colours of its palette."""
 
