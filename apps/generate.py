@@ -46,7 +46,7 @@ OUT.parts. The exit status is 0 if the dataset is complete.
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="generate",
+        prog="hal generate",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Generate a dataset in simulation, in lock-step, on several workers at once.",
         epilog=EXAMPLES,

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from hal.apps._common import run_app, typed_command
+from hal.apps._common import run_app
 
 __all__ = ["BESIDE", "GROUP", "PROGRAMS", "main", "parser"]
 
@@ -121,7 +121,7 @@ def _find_program(name: str) -> Callable[[list[str]], int]:
 
 
 def _list(arguments: list[str]) -> int:
-    made = argparse.ArgumentParser(prog=typed_command("hal list"), description="List built-in models and rigs by name.")
+    made = argparse.ArgumentParser(prog="hal list", description="List built-in models and rigs by name.")
     made.add_argument("kinds", nargs="*", metavar="KIND", help=f"{', '.join(LISTS)} (all)")
     kinds = made.parse_args(arguments).kinds or list(LISTS)
     for kind in kinds:

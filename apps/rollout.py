@@ -66,7 +66,7 @@ MARKS = {"finish": True, "fail": False}
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="rollout",
+        prog="hal rollout",
         description="Run a policy under the limits and the dead-man of manual driving; count successes and record.",
         epilog="Ctrl-C stops the arm. An episode that the policy ends by an error is a failure, and the next follows; "
         "a real arm waits for a new press of the dead-man. The exit status is 1 if any episode ended so.",
