@@ -150,8 +150,8 @@ class Reader:
         if words[0] == "pytest" and any(word.endswith(".py") for word in words):
             return ["-m", "pytest", "-p", "no:cacheprovider", *words[1:]]
         start = ["-m", "hal.apps.main"]
-        if words[0] == "hal" or words[0].startswith("hal-"):
-            program, rest = (words[1], words[2:]) if words[0] == "hal" else (words[0][4:], words[1:])
+        if words[0] == "hal":
+            program, rest = words[1], words[2:]
             start.append(program)
         elif words[0] == "python" and words[1].startswith("apps/"):
             program, rest, start = Path(words[1]).stem, words[2:], [str(ROOT / words[1])]
