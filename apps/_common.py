@@ -44,7 +44,6 @@ __all__ = [
     "robot_names",
     "run_app",
     "select_robots",
-    "typed_command",
 ]
 
 ACTION_NEEDED = 2
@@ -413,7 +412,7 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
 
     Args:
         main: Function of the parsed options that returns the exit status.
-        parser: Its ``prog`` is the program's name (``teleop``); the usage shows the command that was typed.
+        parser: Its ``prog`` is the command, such as ``hal teleop``.
         argv: Arguments; None for those of the process.
 
     Returns:
@@ -422,7 +421,6 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
     from hal.errors import HalError
 
     _open_standard_streams()
-    parser.prog = typed_command(parser.prog)
     link = logging.getLogger("hal.console")
     before, link.disabled = link.disabled, True  # the banner prints the link
     try:
@@ -444,15 +442,6 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
         return 130
     finally:
         link.disabled = before
-
-
-def typed_command(name: str) -> str:
-    """Return the command that started the program ``name``: ``hal teleop``, ``hal-teleop`` or ``teleop.py``."""
-    command, *rest = name.split()
-    typed = Path(sys.argv[0]).name
-    if typed in ("hal", "main.py") and command != "hal":
-        rest = [command, *rest]
-    return " ".join([typed, *rest])
 
 
 def _failed(message: str) -> int:

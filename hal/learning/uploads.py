@@ -1,4 +1,4 @@
-"""Episodes of ``hal-generate`` at an address, for workers that share no folder with the program.
+"""Episodes of ``hal generate`` at an address, for workers that share no folder with the program.
 
 A worker records into a temporary folder of its own computer. After each episode it uploads what is new or has changed
 there as one ZIP file, which appears when it is complete; unpacked in their order, those of a worker are its dataset.
