@@ -30,7 +30,7 @@ PROGRAMS = {
     "grasp": "find an object and grasp it",
     "push": "find an object and push it to a goal",
     "export": "convert a dataset for training",
-    "calibrate": "measure where a camera is",
+    "calibrate": "measure where a camera is, or where a gripper is closed",
     "import-ark": "convert a configuration of Ark",
 }
 LISTS = {
