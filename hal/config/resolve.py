@@ -50,7 +50,9 @@ def resolve(context: Context) -> Plan:
         _check_clock(context)
     _check_rates(context, robots)
     _check_places(context, robots)
-    driver = _world_driver(context)
+    driver: str | None = None
+    with suppress(Unknown):
+        driver = _world_driver(context)
     bodies: tuple[BodySpec, ...] = ()
     with suppress(Unknown):
         bodies = load_objects(context)  # for a real rig, too, so that mistakes in objects are found there
@@ -253,11 +255,17 @@ def _check_places(context: Context, robots: Iterable[RobotSpec]) -> None:
 
 
 def _world_driver(context: Context) -> str | None:
-    """Return the driver of the simulated world that the devices are in; None if there is no simulated device."""
+    """Return the driver of the simulated world that the devices are in; None if there is no simulated device.
+
+    Objects of a simulated rig without arms and cameras are in a world, too.
+    """
     worlds = {key: name for key, name in context.drivers.items() if registry.driver(name).world is not None}
     first = next(iter(worlds.values()), None)
     for key, driver in worlds.items():
         if driver != first:
             message = f"is simulated by {driver!r}, others by {first!r}; a rig has one simulated world"
             context.problem(key, message, "two_worlds")
+    rig = context.rig
+    if rig.objects and not (rig.robots or rig.cameras) and context.rig_sim and context.driver is None:
+        return context.engine_driver
     return first

@@ -139,6 +139,17 @@ def test_without_simulated_devices_there_is_no_world() -> None:
     assert plan(config).world is not None
 
 
+def test_objects_alone_are_in_a_world_of_a_simulated_rig() -> None:
+    objects = {"objects": ["floor", "cube"]}
+    for engine in ("pybullet", "mujoco"):
+        world = plan(objects, engine=engine).world
+        assert world is not None
+        assert (world.driver, [body.name for body in world.bodies]) == (engine, ["floor", "cube"])
+    assert plan(objects, sim=False).world is None
+    assert plan(objects, driver="mock").world is None
+    assert plan({"gamepads": {"pad": {}}}).world is None
+
+
 def test_only_the_chosen_kind_of_options_reaches_the_driver() -> None:
     robot = {"model": "panda", "real": {"host": "1.2.3.4"}, "simulated": {"lag": 0.01}, "drivers": MINE}
     robot["gripper"] = {"drivers": MINE}
