@@ -218,7 +218,7 @@ class TestDynamics:
 
     @pytest.mark.parametrize("height", [0.8606, 1.0, 1.07])
     def test_a_ball_comes_back_wherever_in_a_step_it_touches(self, engine: Engine, height: float) -> None:
-        """It is there after (1 + e) times the time of its fall; from 0.8606 m, it ends a step 0.5 mm above the floor."""
+        """It is there after (1 + e) times the time of its fall; from 0.8606 m a step ends 0.5 mm above the floor."""
         e, radius = 0.7, 0.05
         ball = BodySpec("ball", (0.0, 0.0, height + radius), UPRIGHT, "sphere", radius=radius, mass=0.3)
         world = engine.world(floor(), ball)
