@@ -320,15 +320,19 @@ class Rig:
         return host
 
     def driver(self, name: str) -> Any:
-        """Return the driver object of a device, in lock-step only; for tests that press a mock pad or read its log.
+        """Return the driver object of a device; for tests that press a mock pad or read its log.
+
+        In real time only those of pads and cameras are in this process.
 
         Args:
             name: Name of a robot, a camera or a pad, or ``NAME.gripper`` for a robot's gripper.
 
         Raises:
             DeviceNotFound: No such device.
-            NotSupported: In real time, where drivers are in processes of their own.
+            NotSupported: In real time, for a robot or a gripper, whose drivers are in processes of their own.
         """
+        if name in self._devices:
+            return self._devices[name]
         cycle = self._local.cycle
         drivers: dict[str, Any] = {unit_name: unit.driver for unit_name, unit in cycle.arms.items()}
         drivers |= {unit_name: unit.driver for unit_name, unit in cycle.grippers.items()}

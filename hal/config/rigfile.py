@@ -331,12 +331,15 @@ class CameraConfig(Device):
 class PadConfig(Strict):
     """A gamepad."""
 
+    sim: Flag | None = None
+    """``true``: simulated, which the program operates, or which plays ``file``. ``false``: one that a person operates.
+    Default: as ``driver`` says. The rig's flag is for robots and cameras: a real pad drives a simulated arm."""
     model: str = "auto"
     """``auto``, a name in ``sensors/gamepads/``, or the path of a file of your own."""
     driver: str = "auto"
     """``auto``, ``evdev``, ``web``, ``terminal``, ``playback`` or another driver."""
     file: str | None = None
-    """Recording for the driver ``playback``."""
+    """Recording for a simulated pad, the driver ``playback``."""
     drives: str | None = None
     """Arm that this pad drives where several arms are driven at once; default: the first that no other pad drives."""
     dead_zone: Annotated[float, Quantity("", 0.0, 0.9)] = 0.08
