@@ -277,6 +277,7 @@ def grip(engine: str) -> Iterator[Row]:
         for finger in ("panda_leftfinger", "panda_rightfinger"):
             rig.world.set_dynamics("panda", finger, lateral_friction=1.0)
         rig.world.set_pose("cube", arm.base @ arm.state().tcp)
+        assert arm.gripper is not None
         arm.gripper.grasp(side, force=force)
         rig.clock.sleep(0.5)
         contacts = rig.world.contacts("panda", "cube")
@@ -299,10 +300,13 @@ def load_on_arm(engine: str) -> Iterator[Row]:
     with open_panda(engine) as rig:
         arm = rig.robots["panda"]
         rig.clock.sleep(0.5)
-        yield Row("torque of joint 2, arm alone", "Nm", arm.dynamics.gravity(arm.state().q)[1], arm.state().tau[1])
+        state = arm.state()
+        assert state.tau is not None
+        yield Row("torque of joint 2, arm alone", "Nm", arm.dynamics.gravity(state.q)[1], state.tau[1])
         rig.world.apply_force("panda", force, arm.state().tcp.position, link="panda_hand", duration=2.0)
         rig.clock.sleep(1.0)
         state = arm.state()
+        assert state.tau is not None
         theory = arm.dynamics.gravity(state.q) - arm.kinematics.jacobian(state.q)[:3].T @ force
         yield Row("torque of joint 2, 20 N at the hand", "Nm", theory[1], state.tau[1])
 

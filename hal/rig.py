@@ -21,7 +21,7 @@ from .commands import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
-from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, groups_of
+from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups
 from .host.process import SharedMemory
 from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad
@@ -145,7 +145,7 @@ class Rig:
     def _open(self, *, pad: str | None, viewer: str, console: bool, listen: Listen, realtime: bool) -> None:
         plan = self.plan
         pads = check_opening(plan, pad, viewer, console)
-        groups = groups_of(plan)
+        groups = make_groups(plan)
         world_host = self._start_hosts(groups, realtime)
         if console or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)
@@ -153,13 +153,7 @@ class Rig:
             self._open_world_views(world_host, viewer)
         if viewer == "3d":
             self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
-        refused = False
-        for host in self._hosts:
-            if isinstance(host, RemoteHost):
-                ready = host.wait_ready()
-                refused |= realtime and bool(host.spec.robots) and not self.lock_step and not ready["realtime"]
-        if refused:
-            self._note_refused_priority()
+        self._wait_for_hosts(realtime)
         if world_host is not None:
             self.world = World(world_host.request, partial(self._world_edited, world_host))
         for host in self._hosts:
@@ -180,7 +174,11 @@ class Rig:
         for host in self._hosts:
             host.request("reset_statistics")  # leave out the start
 
-    def _note_refused_priority(self) -> None:
+    def _wait_for_hosts(self, realtime: bool) -> None:
+        """Wait until every process is ready, and note if an arm's did not get the real-time priority it asked for."""
+        ready = [(host.wait_ready(), host.spec.robots) for host in self._hosts if isinstance(host, RemoteHost)]
+        if not realtime or self.lock_step or all(answer["realtime"] or not robots for answer, robots in ready):
+            return
         from .preflight import REALTIME_RIGHT
 
         checked = self.attended and not self.emulated  # the check before a real arm has printed the command

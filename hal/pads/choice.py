@@ -12,7 +12,7 @@ from ..errors import DeviceNotFound, DriverMissing, NotSupported
 from ..registry import PadInput
 from ..specs import PadSpec
 
-__all__ = ["TOUR", "Chosen", "check_wanted", "choose_pad", "pad_choices", "tour"]
+__all__ = ["TOUR", "Chosen", "check_wanted", "choose_pad", "pad_choices", "play_tour"]
 
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
@@ -65,9 +65,9 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
         return Chosen(spec)
     check_wanted(wanted)
     if wanted in (None, _AUTO):
-        return _first(spec, attended and not emulated, lock_step)
+        return _choose_auto(spec, attended and not emulated, lock_step)
     if wanted == registry.pad_driver("plugged"):
-        pads, notes = _plugged()
+        pads, notes = _list_plugged()
         missing = () if pads else ("no gamepad is plugged in yet: plug one in at any time",)
         return Chosen(replace(spec, driver=wanted), (*notes, *missing))
     if wanted in pad_choices() and wanted != _DEMO:
@@ -79,7 +79,7 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
         text = _NO_RECORDING.format(console=registry.pad_driver("console"))
         raise NotSupported(text, code="recording_on_real_arm")
     notes = ("a recording holds the dead-man: every real device here is emulated",) if attended else ()
-    return Chosen(tour(spec) if wanted == _DEMO else _recording(spec, Path(str(wanted))), notes)
+    return Chosen(play_tour(spec) if wanted == _DEMO else _play_file(spec, Path(str(wanted))), notes)
 
 
 def check_wanted(wanted: str | None) -> None:
@@ -93,13 +93,13 @@ def check_wanted(wanted: str | None) -> None:
         raise DeviceNotFound(f"there is no pad {wanted!r}: {choices}, or the path of a recording (.jsonl)")
 
 
-def tour(spec: PadSpec) -> PadSpec:
+def play_tour(spec: PadSpec) -> PadSpec:
     """Return ``spec`` with the recorded tour as its driver."""
-    return _recording(spec, find_data(*TOUR))
+    return _play_file(spec, find_data(*TOUR))
 
 
-def _first(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
-    pads, notes = _plugged()
+def _choose_auto(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
+    pads, notes = _list_plugged()
     if pads:
         return Chosen(replace(spec, driver=registry.pad_driver("plugged")), notes)
     if not lock_step:
@@ -108,10 +108,10 @@ def _first(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
         why = "a real arm does not move without one" if attended else f"gamepads.{spec.name}.sim is false"
         text = f"no gamepad is plugged in, and {why}: plug one in"
         raise DeviceNotFound("; ".join([text, *notes]), code="no_gamepad")
-    return Chosen(tour(spec), (*notes, "lock-step cannot be driven by hand: playing the recorded tour"))
+    return Chosen(play_tour(spec), (*notes, "lock-step cannot be driven by hand: playing the recorded tour"))
 
 
-def _plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _list_plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the gamepads that are plugged in, and notes."""
     try:
         found = registry.load(registry.pad_driver("plugged"), "gamepad").plugged()
@@ -120,5 +120,5 @@ def _plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
     return found.pads, found.notes
 
 
-def _recording(spec: PadSpec, path: Path) -> PadSpec:
+def _play_file(spec: PadSpec, path: Path) -> PadSpec:
     return replace(spec, driver=registry.pad_driver("recording"), options={"file": str(path)})

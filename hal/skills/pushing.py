@@ -13,7 +13,7 @@ from ..arguments import number, vector, whole
 from ..errors import CommandError
 from ..geometry import Pose, tcp_pose
 from .objects import LocatedObject
-from .running import SkillOptions, SkillResult, SkillRun, above, flipped
+from .running import SkillOptions, SkillResult, SkillRun, flip_pose, lift_pose
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -81,9 +81,9 @@ def push(
     number("approach", approach, "m", least=0.0)
     run = SkillRun("push", arm, PHASES, **options)
     with run:
-        ways = [poses, [flipped(pose) for pose in poses]] if flip else [poses]
+        ways = [poses, [flip_pose(pose) for pose in poses]] if flip else [poses]
         heights = (approach, 0.6 * approach)  # lower where the arm does not reach that high
-        way, q = run.choose_way(*([_whole_way(each, height) for each in ways] for height in heights))
+        way, q = run.choose_way(*([_list_poses(each, height) for each in ways] for height in heights))
         start, *rest, away, end = way
         run.begin("close")
         if arm.gripper is not None:
@@ -101,13 +101,13 @@ def push(
     return run.result()
 
 
-def _whole_way(path: Sequence[Pose], approach: float) -> list[Pose]:
+def _list_poses(path: Sequence[Pose], approach: float) -> list[Pose]:
     """Return all poses that a push visits: above its start, along its path, back from its end, and up."""
     last, step = path[-1], path[-1].position - path[-2].position
     length = float(np.linalg.norm(step))
     back = step * (min(1.0, _BEHIND / length) if length > 0.0 else 0.0)
     away = Pose(last.position - back, last.orientation)
-    return [above(path[0], approach), *path, away, above(away, approach)]
+    return [lift_pose(path[0], approach), *path, away, lift_pose(away, approach)]
 
 
 def push_path(
@@ -143,11 +143,11 @@ def push_path(
     yaw = math.atan2(way[1], way[0])
     tilt = _lean(found.table + found.height - z, finger)
 
-    def at(distance: float) -> Pose:
+    def find_pose(distance: float) -> Pose:
         """Return the pose of the tcp at a distance along the way, m."""
         return Pose.from_rpy([*(middle + distance * way), z], (math.pi, -tilt, yaw))
 
-    return [at(-behind - finger - _BEHIND), at(max(length - side, -behind) - finger)]
+    return [find_pose(-behind - finger - _BEHIND), find_pose(max(length - side, -behind) - finger)]
 
 
 def _lean(height: float, finger: float) -> float:
