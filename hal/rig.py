@@ -182,7 +182,7 @@ class Rig:
         from .preflight import REALTIME_RIGHT
 
         checked = self.attended and not self.emulated  # the check before a real arm has printed the command
-        remedy = "hal-check prints what allows it" if checked else f"to allow it: {REALTIME_RIGHT}"
+        remedy = "hal check prints what allows it" if checked else f"to allow it: {REALTIME_RIGHT}"
         self.notes.append(f"real-time priority (SCHED_FIFO) is refused: a busy computer delays the servos; {remedy}")
 
     def _start_hosts(self, groups: Sequence[GroupSpec], realtime: bool) -> Host | None:
@@ -318,15 +318,19 @@ class Rig:
         return host
 
     def driver(self, name: str) -> Any:
-        """Return the driver object of a device, in lock-step only; for tests that press a mock pad or read its log.
+        """Return the driver object of a device; for tests that press a mock pad or read its log.
+
+        In real time only those of pads and cameras are in this process.
 
         Args:
             name: Name of a robot, a camera or a pad, or ``NAME.gripper`` for a robot's gripper.
 
         Raises:
             DeviceNotFound: No such device.
-            NotSupported: In real time, where drivers are in processes of their own.
+            NotSupported: In real time, for a robot or a gripper, whose drivers are in processes of their own.
         """
+        if name in self._devices:
+            return self._devices[name]
         cycle = self._local.cycle
         drivers: dict[str, Any] = {unit_name: unit.driver for unit_name, unit in cycle.arms.items()}
         drivers |= {unit_name: unit.driver for unit_name, unit in cycle.grippers.items()}

@@ -50,7 +50,9 @@ def resolve(context: Context) -> Plan:
         _check_clock(context)
     _check_rates(context, robots)
     _check_places(context, robots)
-    driver = _world_driver(context)
+    driver: str | None = None
+    with suppress(Unknown):
+        driver = _world_driver(context)
     bodies: tuple[BodySpec, ...] = ()
     with suppress(Unknown):
         bodies = load_objects(context)  # for a real rig, too, so that mistakes in objects are found there
@@ -135,33 +137,58 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
     model: dict[str, Any] | None = None
     with suppress(Unknown):
         model = _pad_model(context, key, config)
-    if context.driver is None:
+    driver, real = context.driver, False
+    if driver is None:
         with suppress(Unknown):
-            if config.driver == CHOSEN_LATER or context.check_driver(config.driver, "gamepad", f"{key}.driver"):
-                _check_recording(context, f"{key}.file", config)
+            driver, real = _pad_driver(context, key, config), config.sim is False
+            if driver is not None:
+                _check_recording(context, f"{key}.file", config, driver)
     with suppress(Unknown):
         if config.drives is not None and config.drives not in context.rig.robots:
             message = f"there is no robot {config.drives!r}{suggest(config.drives, context.rig.robots)}"
             context.report(f"{key}.drives", message, "unknown_robot")
     models = tuple(load_pad_models(context.problems).values())
-    if context.problems.found:
+    if context.problems.found or driver is None:
         return None
     options = dict(config.options)
     if config.file is not None:
         options["file"] = str(user_path(config.file, context.base))
     spec = PadSpec(
         name=name,
-        driver=context.driver or config.driver,
+        driver=driver,
         model=model,
         models=models,
         dead_zone=config.dead_zone,
         drives=config.drives,
         options=options,
+        real=real,
     )
     if spec.driver != CHOSEN_LATER:
         for relative, message, code in registry.check_record(spec.driver, "gamepad", spec):
             context.report(f"{key}.{relative}", message, code)
     return spec
+
+
+def _pad_driver(context: Context, key: str, config: PadConfig) -> str | None:
+    """Return the driver of a gamepad by its ``driver`` and its flag; None, and the problem, if there is no such driver.
+
+    The problem is added, too, if the two contradict each other.
+    """
+    program, recording = registry.pad_driver("program"), registry.pad_driver("recording")
+    if config.driver == CHOSEN_LATER:
+        if not config.sim:
+            return CHOSEN_LATER
+        if config.file is None and config.options:
+            context.report(f"{key}.options", "are for a recording, and no file names one", "conflict")
+        return program if config.file is None else recording
+    if not context.check_driver(config.driver, "gamepad", f"{key}.driver"):
+        return None
+    known = registry.driver(config.driver).pad_input is not None
+    if known and config.sim is not None and config.sim != (config.driver in (program, recording)):
+        kind = "a real pad" if config.sim else "a simulated pad"
+        message = f"is {str(config.sim).lower()}, and the driver {config.driver!r} is {kind}: leave one of the two out"
+        context.report(f"{key}.sim", message, "conflict")
+    return config.driver
 
 
 def _pad_model(context: Context, key: str, config: PadConfig) -> dict[str, Any] | None:
@@ -181,11 +208,11 @@ def _pad_model(context: Context, key: str, config: PadConfig) -> dict[str, Any] 
     return data
 
 
-def _check_recording(context: Context, key: str, config: PadConfig) -> None:
-    plays = config.driver != CHOSEN_LATER and registry.driver(config.driver).pad_input == "recording"
-    if not plays:
+def _check_recording(context: Context, key: str, config: PadConfig, driver: str) -> None:
+    if driver != registry.pad_driver("recording"):
         if config.file is not None:
-            message = f"is for the driver {registry.pad_driver('recording')}, not {config.driver!r}"
+            own = "sim is false" if config.sim is False else f"the driver is {driver!r}"
+            message = f"is what a simulated pad plays (sim: true), and {own} here"
             context.report(key, message, "conflict")
     elif config.file is None:
         context.report(key, "is missing: the recording to play", "missing_key")
@@ -255,11 +282,17 @@ def _check_places(context: Context, robots: Iterable[RobotSpec]) -> None:
 
 
 def _world_driver(context: Context) -> str | None:
-    """Return the driver of the simulated world that the devices are in; None if there is no simulated device."""
+    """Return the driver of the simulated world that the devices are in; None if there is no simulated device.
+
+    Objects of a simulated rig without arms and cameras are in a world, too.
+    """
     worlds = {key: name for key, name in context.drivers.items() if registry.driver(name).world is not None}
     first = next(iter(worlds.values()), None)
     for key, driver in worlds.items():
         if driver != first:
             message = f"is simulated by {driver!r}, others by {first!r}; a rig has one simulated world"
             context.report(key, message, "two_worlds")
+    rig = context.rig
+    if rig.objects and not (rig.robots or rig.cameras) and context.rig_sim and context.driver is None:
+        return context.engine_driver
     return first

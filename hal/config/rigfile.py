@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
-from ..registry import EngineChoice
+from ..registry import explain_engine
 from ..specs import ViewSpec
 from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, SensorStream, expand_names
 from .schema import (
@@ -331,12 +331,15 @@ class CameraConfig(Device):
 class PadConfig(Strict):
     """A gamepad."""
 
+    sim: Flag | None = None
+    """``true``: simulated, which the program operates, or which plays ``file``. ``false``: one that a person operates.
+    Default: as ``driver`` says. The rig's flag is for robots and cameras: a real pad drives a simulated arm."""
     model: str = "auto"
     """``auto``, a name in ``sensors/gamepads/``, or the path of a file of your own."""
     driver: str = "auto"
     """``auto``, ``evdev``, ``web``, ``terminal``, ``playback`` or another driver."""
     file: str | None = None
-    """Recording for the driver ``playback``."""
+    """Recording for a simulated pad, the driver ``playback``."""
     drives: str | None = None
     """Arm that this pad drives where several arms are driven at once; default: the first that no other pad drives."""
     dead_zone: Annotated[float, Quantity("", 0.0, 0.9)] = 0.08
@@ -345,11 +348,18 @@ class PadConfig(Strict):
     """Options of the driver."""
 
 
+def _check_engine(name: str) -> str:
+    if message := explain_engine(name):
+        raise ValueProblem(message, "invalid_choice")
+    return name
+
+
 class SimulationConfig(Strict):
     """The simulated world."""
 
-    engine: EngineChoice = "auto"
-    """The physics engine; ``auto`` is PyBullet where it is installed, else MuJoCo."""
+    engine: Annotated[str, AfterValidator(_check_engine)] = "auto"
+    """The physics engine: ``pybullet``, ``mujoco`` or a driver with a world; ``auto`` is PyBullet where it is
+    installed, else MuJoCo."""
     physics_hz: Annotated[float, Quantity("Hz", 50.0, 10000.0)] = 240.0
     """Steps of the simulation, and of the servos in it, per second."""
     gravity: Gravity = (0.0, 0.0, -9.81)

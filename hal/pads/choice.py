@@ -48,7 +48,7 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
     """Choose the driver of a gamepad whose driver is ``auto``; any other gamepad stays as it is.
 
     ``auto`` is a gamepad that is plugged in, else the console, which any browser can drive. In lock-step, where nothing
-    can be driven by hand, it is the recorded tour.
+    can be driven by hand, it is the recorded tour, unless the rig wants a real pad (:attr:`.PadSpec.real`).
 
     Args:
         spec: The gamepad of the rig file.
@@ -58,8 +58,8 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
         emulated: Whether every real device is an emulator, so that a recording may drive it.
 
     Raises:
-        DeviceNotFound: No such choice or recording, or no gamepad for a real arm in lock-step.
-        NotSupported: A recording for a real arm.
+        DeviceNotFound: No such choice or recording, or no gamepad for a real arm, or a real pad, in lock-step.
+        NotSupported: A recording for a real arm, or in the place of a real pad.
     """
     if spec.driver != _AUTO:
         return Chosen(spec)
@@ -72,6 +72,9 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
         return Chosen(replace(spec, driver=wanted), (*notes, *missing))
     if wanted in pad_choices() and wanted != _DEMO:
         return Chosen(replace(spec, driver=wanted))
+    if spec.real:
+        text = f"gamepads.{spec.name}.sim is false: a recording is no real pad; leave that key out, or the recording"
+        raise NotSupported(text, code="recording_of_real_pad")
     if attended and not emulated:
         text = _NO_RECORDING.format(console=registry.pad_driver("console"))
         raise NotSupported(text, code="recording_on_real_arm")
@@ -101,8 +104,9 @@ def _choose_auto(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
         return Chosen(replace(spec, driver=registry.pad_driver("plugged")), notes)
     if not lock_step:
         return Chosen(replace(spec, driver=registry.pad_driver("console")), notes)
-    if attended:
-        text = "no gamepad is plugged in, and a real arm does not move without one: plug one in"
+    if attended or spec.real:
+        why = "a real arm does not move without one" if attended else f"gamepads.{spec.name}.sim is false"
+        text = f"no gamepad is plugged in, and {why}: plug one in"
         raise DeviceNotFound("; ".join([text, *notes]), code="no_gamepad")
     return Chosen(play_tour(spec), (*notes, "lock-step cannot be driven by hand: playing the recorded tour"))
 

@@ -36,6 +36,9 @@ _BEHIND = 0.02
 """Distance from the object at which the fingers come down, and to which they back off, m."""
 _LET_GO = 0.01
 """By how much the fingers open before they back off, m."""
+_TURN = 2.0
+"""Length of the way on which an object turns until a side lies against the fingers, as a multiple of the distance from
+its middle to its corner behind."""
 _SAME_PLACE = 1e-3
 """Distance below which an object needs no push, m."""
 
@@ -114,7 +117,7 @@ def push_path(
 
     The tcp's z axis points down and its fingers close across the way, so that both touch the object; if the palm would
     touch it first, the hand leans back. The side of the box around the object that faces the fingers most is taken to
-    come to lie against them.
+    come to lie against them, but the shorter the way, the less the object turns on it.
 
     Args:
         found: The object.
@@ -135,6 +138,7 @@ def push_path(
     axes = found.pose.matrix()[:2, :2]
     side = 0.5 * found.size[int(np.argmax(np.abs(way @ axes)))]
     behind = float(np.max((middle - found.points[:, :2]) @ way))
+    side += (behind - side) * max(0.0, 1.0 - length / (_TURN * behind))
     z = found.table + max(clearance, min(height, 0.4 * found.height))
     yaw = math.atan2(way[1], way[0])
     tilt = _lean(found.table + found.height - z, finger)
