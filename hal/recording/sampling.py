@@ -102,7 +102,7 @@ class CameraBuffer:
         if not self._lock_step:  # before the first picture, so that neither a frame nor a loss is missed
             self._detach = [self.camera.on_frame(self._add_frame), self.camera.on_connection(self._mark_lost)]
         try:
-            first = self.camera.latest(max_age=_SILENT)
+            first = self.camera.read_latest(max_age=_SILENT)
         except StaleStateError:
             first = self.camera.read(timeout=_FIRST_PICTURE, after=self.camera.clock.now() - _SILENT)
         with self._lock:
@@ -134,7 +134,7 @@ class CameraBuffer:
             StaleStateError: Its newest picture is more than a second older than ``t``.
         """
         if self._lock_step:
-            return self.camera.latest()
+            return self.camera.read_latest()
         if self._lost is not None and t > self._lost[0]:
             raise self._lost[1]
         with self._lock:

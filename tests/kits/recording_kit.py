@@ -218,6 +218,6 @@ class Stage:
         return Likeness(10.0 * math.log10(255.0**2 / max(error, 1e-9)), int(wrong.sum()))
 
     def pose(self, camera: str) -> Pose:
-        where = self.rig.cameras[camera].latest().T_world_camera
+        where = self.rig.cameras[camera].read_latest().T_world_camera
         assert where is not None
         return where

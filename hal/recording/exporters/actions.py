@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import CommandError
-from ...geometry import after_rotation, difference, quaternion_to_matrix
+from ...geometry import apply_rotation, difference, quaternion_to_matrix
 from ..layout import ACTION, SETPOINT
 from .content import ArmColumns, EpisodeContent
 
@@ -161,7 +161,7 @@ def _step(content: EpisodeContent, arm: ArmColumns, form: RotationForm) -> tuple
     steps = np.array([difference(start, end) for start, end in pairwise(poses)])
     if form == "axis_angle":
         return steps[:, :3], steps[:, 3:]
-    return steps[:, :3], np.array([_rotation(after_rotation((0.0, 0.0, 0.0, 1.0), step[3:]), form) for step in steps])
+    return steps[:, :3], np.array([_rotation(apply_rotation((0.0, 0.0, 0.0, 1.0), step[3:]), form) for step in steps])
 
 
 def _rotation(quaternion: ArrayLike, form: RotationForm) -> Array:
