@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import CommandError, DatasetError
+from .about import read_about
 from .dataset import Dataset, Episode
 from .foreign import is_foreign
-from .index import check_next_episode, dataset_errors, read_about, read_entries, read_index, read_tasks, stray_files
+from .index import check_next_episode, read_entries, read_index, read_tasks, stray_files
 from .layout import (
     BOOKKEEPING,
     SEGMENTATION,
@@ -28,6 +29,7 @@ from .layout import (
     finish_replacement,
     video_names,
 )
+from .validation import dataset_errors
 
 __all__ = [
     "check_compatible",

@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError
-from .codecs import key_frames
 from .dataset import Dataset, Episode, KeptRows
-from .index import checked_name, dataset_errors
 from .layout import (
     GRID,
     SETPOINT,
@@ -28,6 +26,8 @@ from .layout import (
     video_names,
 )
 from .merging import existing_episodes, extract, merge, open_dataset
+from .validation import checked_name, dataset_errors
+from .videos import key_frames
 
 __all__ = ["KeptRows", "find_motion", "shares", "split", "trim"]
 

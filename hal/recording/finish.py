@@ -19,20 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, HalError
+from .about import read_about, split_about
 from .checking import check_index, check_rows
-from .codecs import Stats, column_stats, merge_stats, picture_stats, remux, stats_as_lists
+from .codecs import Stats, column_stats, merge_stats, stats_as_lists
 from .dataset import Episode
-from .index import (
-    _TASK,
-    check_next_episode,
-    dataset_errors,
-    next_place,
-    read_about,
-    read_index,
-    read_tasks,
-    stray_files,
-    validated_info,
-)
+from .index import _TASK, check_next_episode, next_place, read_index, read_tasks, stray_files, validated_info
 from .layout import (
     ACTION,
     CHUNK,
@@ -59,6 +50,8 @@ from .layout import (
 )
 from .live import LiveContent, read_live
 from .metadata import ClockPace
+from .validation import dataset_errors
+from .videos import picture_stats, remux
 
 __all__ = [
     "CLOSING",
@@ -307,7 +300,11 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         for name in camera.depths:
             made.append((rest.folder / f"{name}.depth", layout.depth(name, number)))
     place, entries = _continued(layout, closed, place, start, fps, stats)
-    write_json(final / "about.json", closed | place.as_json())
+    own, name, common = split_about(closed | place.as_json())
+    if not layout.common(name).exists():
+        write_json(final / "common.json", common)
+        made.append((final / "common.json", layout.common(name)))
+    write_json(final / "about.json", own, indent=None)
     made.append((final / "about.json", layout.about(number)))
 
     write_table(final / "entry.parquet", entries)

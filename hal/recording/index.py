@@ -2,67 +2,34 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import shlex
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import Field
 
-from ..errors import DatasetError, HalError
+from ..errors import DatasetError
+from .about import read_about
 from .layout import CHUNK, DatasetLayout, EpisodePlace, read_json, video_names
+from .validation import CameraName, Feature, Model, dataset_errors
 
 __all__ = [
-    "CameraName",
     "check_next_episode",
-    "checked_name",
     "next_place",
-    "read_about",
     "read_entries",
     "read_index",
     "read_tasks",
-    "dataset_errors",
     "repair_command",
     "stray_files",
     "validated_info",
 ]
 
-_SIDE = 16384
-"""Pixels; no picture is larger."""
-_DISK_REFUSES = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 _TASK = "__index_level_0__"
 """LeRobot's name of the column of texts in ``meta/tasks.parquet``."""
 
 
-def checked_name(name: str) -> str:
-    """Return ``name``, a part of a file name. Raises ValueError for one that would lead to another folder."""
-    if not name or "/" in name or "\0" in name or name in (".", ".."):
-        raise ValueError("must be a name without slashes")
-    return name
-
-
-CameraName = Annotated[str, AfterValidator(checked_name)]
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(strict=True, extra="ignore")
-
-
-class _Feature(_Model):
-    dtype: str
-    shape: list[Annotated[int, Field(ge=1, le=_SIDE)]]
-    names: list[str] | None = None
-
-    @model_validator(mode="after")
-    def _has_a_name_per_number(self) -> _Feature:
-        if self.dtype != "video" and self.names is not None and [len(self.names)] != self.shape:
-            raise ValueError(f"{len(self.names)} names for the shape {self.shape}")
-        return self
-
-
-class _Info(_Model):
+class _Info(Model):
     """The keys of ``meta/info.json`` that are used here."""
 
     codebase_version: str
@@ -70,79 +37,7 @@ class _Info(_Model):
     robot_type: str | None = None
     total_episodes: Annotated[int, Field(ge=0, le=CHUNK * CHUNK)]
     total_frames: Annotated[int, Field(ge=0)]
-    features: dict[CameraName, _Feature]
-
-
-class _Camera(_Model):
-    K: Annotated[list[Annotated[list[float], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)]
-    distortion: list[float]
-    depth_unit_m: Annotated[FiniteFloat, Field(gt=0)] | None = None
-    streams: list[str] = []
-
-
-class _World(_Model):
-    driver: str
-
-
-class _Robot(_Model):
-    name: str
-    model: str
-    driver: str
-    base_position: Annotated[list[float], Field(min_length=3, max_length=3)]
-    base_orientation: Annotated[list[float], Field(min_length=4, max_length=4)]
-
-
-class _View(_Model):
-    robot: str | None = None
-
-
-class _RigCamera(_Model):
-    name: str
-    view: _View | None = None
-
-
-class _Resolved(_Model):
-    world: _World | None = None
-    robots: list[_Robot] = []
-    cameras: list[_RigCamera] = []
-
-
-class _Rig(_Model):
-    resolved: _Resolved
-
-
-_At = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
-
-
-class _Files(_Model):
-    index: Annotated[int, Field(ge=0)]
-    data: _At
-    videos: dict[CameraName, _At]
-
-
-class _About(_Model):
-    """The keys of ``episodes/N.json`` that are used here."""
-
-    length: Annotated[int, Field(ge=1)]
-    t_start: FiniteFloat
-    task: str
-    success: bool | None
-    cameras: dict[CameraName, _Camera]
-    rig: _Rig
-    dropped: int | None = None
-    gaps: list[Any] = []
-    trouble: str | None = None
-    recovered: bool = False
-    pace: dict[str, float] = {}
-    info: dict[str, Any] = {}
-    seed: int | None = None
-    started: str | None = None
-    fps: Annotated[int, Field(ge=1, le=1000)] | None = None
-    robot_type: str | None = None
-    clock: Literal["real_time", "lock_step"] | None = None
-    files: _Files | None = None
-    features: dict[CameraName, _Feature] | None = None
-    """Missing in episodes of older versions."""
+    features: dict[CameraName, Feature]
 
 
 def repair_command(layout: DatasetLayout) -> str:
@@ -150,42 +45,11 @@ def repair_command(layout: DatasetLayout) -> str:
     return f"hal-review {shlex.quote(str(layout.root))} --repair"
 
 
-@contextlib.contextmanager
-def dataset_errors(root: Path, path: Path, episode: int | None = None) -> Iterator[None]:
-    """Raise any error of a missing or damaged file as a DatasetError that names the file and the episode.
-
-    A disk that refuses what is written meanwhile is no damage: its OSError is raised as it is.
-    """
-    try:
-        yield
-    except HalError:
-        raise
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno in _DISK_REFUSES:
-            raise
-        file = str(path.relative_to(root)) if path.is_relative_to(root) else str(path)
-        raise DatasetError(_reason(error), file=file, episode=episode) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, FileNotFoundError):
-        return "is missing"
-    if isinstance(error, ValidationError):
-        first = error.errors(include_url=False, include_input=False)[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    text = (str(error).splitlines() or [""])[0][:200]
-    return f"cannot be read: {text or type(error).__name__}"
-
-
-def _validated(model: type[BaseModel], data: Any) -> dict[str, Any]:
-    model.model_validate(data)
-    found: dict[str, Any] = data
-    return found
-
-
 def validated_info(data: Any) -> dict[str, Any]:
     """Return ``data`` if it is a valid ``meta/info.json``. Raises pydantic's ValidationError."""
-    return _validated(_Info, data)
+    _Info.model_validate(data)
+    found: dict[str, Any] = data
+    return found
 
 
 def read_index(layout: DatasetLayout) -> dict[str, Any] | None:
@@ -263,13 +127,6 @@ def stray_files(
     """Return the files of finished episodes that belong to none of these (number, place)."""
     known = {path for number, place in places for path in layout.files_of(number, place, videos)}
     return [path for path in layout.finished() if path not in known]
-
-
-def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:
-    """Return ``episodes/N.json`` of an episode. Raises DatasetError."""
-    path = layout.about(number)
-    with dataset_errors(layout.root, path, number):
-        return _validated(_About, read_json(path))
 
 
 def read_entries(path: Path, *, stats: bool) -> dict[int, dict[str, Any]]:

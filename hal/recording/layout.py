@@ -300,9 +300,22 @@ class DatasetLayout:
         """Return the path of an episode's metadata."""
         return self.episodes / f"{number:06d}.json"
 
+    def common(self, name: str) -> Path:
+        """Return the path of metadata that several episodes have in common, by its name."""
+        return self.episodes / f"{name}.json"
+
+    def commons(self) -> Iterator[Path]:
+        """Yield every file of metadata that episodes have in common."""
+        return self.episodes.glob("common-*.json")
+
     def partial(self, number: int) -> Path:
         """Return the folder of an episode that is not part of the dataset yet."""
         return self.episodes / f"{number:06d}.partial"
+
+    @property
+    def change(self) -> Path:
+        """The partial folder of a change of finished episodes (:mod:`~hal.recording.changing`)."""
+        return self.episodes / "change.partial"
 
     def partials(self) -> list[Path]:
         """Return all partial folders, oldest first."""
@@ -548,12 +561,12 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: Any, indent: int | None = 1) -> None:
     """Write a JSON file, whole or not at all. Numbers that are not finite become null: JSON has no NaN."""
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
     with beside.open("x", encoding="utf-8") as file:
-        file.write(json.dumps(_finite(data), indent=1, default=str, allow_nan=False) + "\n")
+        file.write(json.dumps(_finite(data), indent=indent, default=str, allow_nan=False) + "\n")
     sync_to_disk(beside)
     beside.replace(path)
     sync_to_disk(path.parent)

@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import shutil
+import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
@@ -22,21 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError
+from .about import split_about
 from .checking import format_differences
-from .codecs import (
-    Stats,
-    VideoPart,
-    can_be_joined,
-    column_stats,
-    copy_records,
-    join_videos,
-    merge_stats,
-    stats_as_lists,
-)
+from .codecs import Stats, column_stats, copy_records, merge_stats, stats_as_lists
 from .dataset import Dataset, Episode
 from .finish import entries_table, entry_row, last_row, new_info, stats_of, tasks_table, write_table
 from .foreign import is_foreign
-from .index import check_next_episode, dataset_errors, read_entries, read_tasks, stray_files
+from .index import check_next_episode, read_entries, read_tasks, stray_files
 from .layout import (
     CHUNK,
     GROUP,
@@ -51,6 +44,8 @@ from .layout import (
     video_names,
     write_json,
 )
+from .validation import dataset_errors
+from .videos import VideoPart, can_be_joined, join_videos
 
 __all__ = [
     "EpisodeLabel",
@@ -66,6 +61,8 @@ __all__ = [
 
 _LOG = logging.getLogger("hal.recording")
 _THREADS = 4
+_ROWS = 1000
+"""Rows of a group of rows, at least: a group takes some kB of its own, and is read whole."""
 
 
 class EpisodeLabel(NamedTuple):
@@ -163,7 +160,7 @@ def _keep_other_files(old: DatasetLayout, new: DatasetLayout) -> None:
         raise error
 
     old.sweep()
-    own = {*old.finished(), old.info, old.stats, old.tasks, old.episodes / ".lock"}
+    own = {*old.finished(), *old.commons(), old.info, old.stats, old.tasks, old.episodes / ".lock"}
     for folder, folders, files in os.walk(old.root, onerror=refuse):
         links = [name for name in folders if Path(folder, name).is_symlink()]
         for path in (Path(folder, name) for name in (*files, *links)):
@@ -352,6 +349,7 @@ class _Builder:
         """Number of each episode's first row in the whole dataset; then of all rows."""
         self._entries = lru_cache(maxsize=2 * _THREADS)(partial(read_entries, stats=True))
         self._tasks = lru_cache(maxsize=None)(read_tasks)
+        self._writing = threading.Lock()
         self._places: dict[str, list[tuple[int, int]]] = {}
         """File of each video of each episode, and the number of its first picture there."""
 
@@ -454,10 +452,7 @@ class _Builder:
             first = self.starts[number] - self.starts[begin]
             place = EpisodePlace(group, (group, first), {name: at[number] for name, at in self._places.items()})
             about = episode.info | {"episode": number} | label._asdict() | place.as_json()
-            if about == episode.info and episode.rows is None:
-                _link(episode._layout.about(number), self.layout.about(number))
-            else:
-                self.layout.about(number).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+            self._write_about(number, about)
             for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
                 if path.suffix == ".depth":
                     with dataset_errors(episode._layout.root, path, episode.number):
@@ -470,6 +465,13 @@ class _Builder:
             found.append(stats)
         write_table(self.layout.entry(group), entries_table(rows))
         return found
+
+    def _write_about(self, number: int, about: Mapping[str, Any]) -> None:
+        own, name, common = split_about(about)
+        with self._writing:
+            if not self.layout.common(name).exists():
+                write_json(self.layout.common(name), common)
+        self.layout.about(number).write_text(json.dumps(own) + "\n", encoding="utf-8")
 
     def _entry(self, number: int) -> dict[str, Any]:
         """Return the row of an episode of the result in the index of its part."""
@@ -531,12 +533,13 @@ class _Builder:
         return path if len(sharing) == len(numbers) else None
 
     def _write_rows(self, path: Path, numbers: range) -> None:
-        """Write the rows of some episodes with their new numbers, each as a row group of its own."""
+        """Write the rows of some episodes with their new numbers, in row groups of :data:`_ROWS` rows or more."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         with contextlib.ExitStack() as stack:
             file: Any = None
+            waiting: list[Any] = []
             for number in numbers:
                 episode = self.sources[number].episode
                 table = episode.read_table().replace_schema_metadata()
@@ -545,7 +548,11 @@ class _Builder:
                         table = table.set_column(table.schema.get_field_index(key), key, pa.array(values))
                     if file is None:
                         file = stack.enter_context(pq.ParquetWriter(path, table.schema, write_page_checksum=True))
-                    file.write_table(table.cast(file.schema), row_group_size=len(table))
+                    waiting.append(table.cast(file.schema))
+                if number == numbers[-1] or sum(map(len, waiting)) >= _ROWS:
+                    group = pa.concat_tables(waiting)
+                    file.write_table(group, row_group_size=len(group))
+                    waiting = []
 
 
 class _Run(NamedTuple):

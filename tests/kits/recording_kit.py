@@ -6,6 +6,7 @@ First recordings of mock rigs, then one to export, then a second rig in which re
 from __future__ import annotations
 
 import atexit
+import json
 import math
 import shutil
 import tempfile
@@ -41,6 +42,7 @@ __all__ = [
     "check_layout",
     "check_stamps",
     "drive",
+    "join_metadata",
     "kill_writer",
     "make_recording",
     "mock_rig",
@@ -148,6 +150,16 @@ def _recording() -> Path:
         record(recorder, 0.4, MARKS[1])
         record(recorder, 0.3, MARKS[2])
     return folder
+
+
+def join_metadata(root: Path) -> None:
+    """Put all metadata of each episode into its own file, as earlier versions did."""
+    for path in root.glob("episodes/[0-9]*.json"):
+        about = json.loads(path.read_text())
+        common = json.loads(path.with_name(f"{about.pop('common')}.json").read_text())
+        path.write_text(json.dumps(common | about))
+    for path in root.glob("episodes/common-*.json"):
+        path.unlink()
 
 
 def pictures(dataset: Dataset, what: str, camera: str) -> list[np.ndarray[Any, Any]]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import check_layout, drive, kill_writer, make_recording, mock_rig, record
+from recording_kit import check_layout, drive, join_metadata, kill_writer, make_recording, mock_rig, record
 
 from hal.errors import CommandError, ConnectionLost, DatasetError, DeviceNotFound, HalError
 from hal.learning.replay import RecordedTrajectory
@@ -48,8 +48,8 @@ def rig() -> Iterator[Rig]:
 
 EACH = 2 + 2 + 2
 """Files of an episode: rows and own file, two videos, two of depth."""
-INDEX = 4
-"""Files of the index."""
+INDEX = 4 + 1
+"""Files of the index, and of the metadata that the episodes have in common."""
 
 
 def files(root: Path, episodes: Sequence[int] = (0, 1, 2)) -> list[Path]:
@@ -61,7 +61,8 @@ def files(root: Path, episodes: Sequence[int] = (0, 1, 2)) -> list[Path]:
 
 def number_of(path: Path) -> int | None:
     """Return the number of the episode that a file belongs to; None for the index."""
-    return int(path.stem[-3:]) if path.stem[-3:].isdecimal() and "meta" not in path.parts else None
+    own = path.stem[-3:].isdecimal() and "meta" not in path.parts and "common" not in path.stem
+    return int(path.stem[-3:]) if own else None
 
 
 # What reads a dataset.
@@ -286,6 +287,7 @@ def test_an_index_cannot_be_rebuilt_without_every_episode(out: Path) -> None:
 
 
 def test_episodes_of_an_older_version_need_the_names_of_their_columns(whole: Path, out: Path) -> None:
+    join_metadata(out)
     for file in out.glob("episodes/*.json"):
         about = json.loads(file.read_text())
         del about["features"]

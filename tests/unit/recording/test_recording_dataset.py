@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import CAMERAS, check_layout, drive, kill_writer, mock_rig, record, small
+from recording_kit import CAMERAS, check_layout, drive, join_metadata, kill_writer, mock_rig, record, small
 
 import hal
 from hal.errors import CommandError, DeviceNotFound, HalError
@@ -58,10 +58,10 @@ def test_columns_of_a_long_dataset_do_not_fill_the_memory(made: Path, monkeypatc
     first, second, third = Dataset(made).episodes
     before = first.columns
     size = sum(values.nbytes for values in before.values())
-    monkeypatch.setattr(dataset, "_MEMORY", dataset._ColumnMemory(2 * size))
+    monkeypatch.setattr(dataset, "_MEMORY", dataset._ReadMemory(2 * size))
     for episode in (second, third):
         episode.__dict__.pop("columns", None)
-    dataset._MEMORY.add(first, before)
+    dataset._MEMORY.add(first, "columns", size)
     assert second.columns is second.columns
     assert first.columns is before, "both fit"
     assert third.columns is third.columns
@@ -160,6 +160,7 @@ def test_depth_is_kept_by_all_episodes_or_by_none(tmp_path: Path) -> None:
 def test_depth_in_another_unit_is_another_kind(made: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(made, copy)
+    join_metadata(copy)
     for file in copy.glob("episodes/*.json"):
         about = json.loads(file.read_text())
         unit = about["cameras"]["wrist"]["depth_unit_m"]

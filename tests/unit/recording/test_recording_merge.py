@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import CAMERAS, check_layout, mock_rig, record
+from recording_kit import CAMERAS, check_layout, join_metadata, mock_rig, record
 
 from hal.errors import CommandError, DatasetError
 from hal.recording import (
@@ -114,6 +114,7 @@ def test_a_key_sorts_and_takes_each_once(part: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_merged_is_refused(part: Path, tmp_path: Path) -> None:
     copy, out = tmp_path / "copy", tmp_path / "out"
     shutil.copytree(part, copy)
+    join_metadata(copy)
     with raises_code(CommandError, "output_exists"):
         merge([part], copy)
     with raises_code(CommandError, "no_folder"):
@@ -330,15 +331,15 @@ def test_a_reader_follows_joined_files_and_refuses_another_episode(
     assert opened.episodes[1].place.data == (0, before.episodes[0].length)
     assert opened.episodes[1].success is False
 
-    fresh, read_video = Dataset(demo).episodes[0], dataset_module.read_video
+    fresh, read_picture = Dataset(demo).episodes[0], dataset_module.read_picture
 
     def read_after_a_deletion(*args: Any) -> Any:
         delete_episodes(demo, [0])
-        return read_video(*args)
+        return read_picture(*args)
 
     fresh.files("wrist")
     with monkeypatch.context() as patched, raises_code(DatasetError, "dataset_changed"):
-        patched.setattr(dataset_module, "read_video", read_after_a_deletion)
+        patched.setattr(dataset_module, "read_picture", read_after_a_deletion)
         fresh.frame("wrist", 0)
     first = opened.episodes[0]
     for read in (lambda: next(first.frames("wrist")), lambda: first.frame("wrist", 0), first.read_table):
@@ -509,6 +510,7 @@ def make_old(root: Path) -> None:
         return key.replace("rig.", "observation.")
 
     new = ("source", "intervention", "next.done", "next.success")
+    join_metadata(root)
     for path in [root / "meta/info.json", *root.glob("episodes/*.json")]:
         about = json.loads(path.read_text())
         about.pop("files", None)
