@@ -104,7 +104,9 @@ def parser() -> argparse.ArgumentParser:
 
     add("pack", "join the files of episodes, which recorders do from 100 on").add_argument("dataset", metavar="DATASET")
     add("check", "compare every file with the index").add_argument("dataset", metavar="DATASET")
-    add("repair", "finish interrupted episodes, and rebuild a lost index").add_argument("dataset", metavar="DATASET")
+    add(
+        "repair", "finish interrupted episodes, rebuild a lost index, and close grasps of earlier versions"
+    ).add_argument("dataset", metavar="DATASET")
     return made
 
 

@@ -137,7 +137,6 @@ def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:
         own["info"] = own.get("info", {}) | {"recipe": common["recipe"]}
     found = common | own
     found.pop("recipe", None)
-    found.pop("common", None)
     return found
 
 
@@ -161,6 +160,15 @@ def split_about(about: Mapping[str, Any]) -> tuple[dict[str, Any], str, dict[str
     if "recipe" in (info := dict(own.get("info") or {})):
         common["recipe"] = info.pop("recipe")
         own["info"] = info
-    text = json.dumps(common, sort_keys=True, default=str)
-    name = f"common-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    values = tuple(map(id, common.values()))
+    if values not in _NAMES:
+        if len(_NAMES) >= 64:
+            _NAMES.clear()
+        text = json.dumps(common, sort_keys=True, default=str)
+        _NAMES[values] = f"common-{hashlib.sha256(text.encode()).hexdigest()[:12]}", common
+    name, _ = _NAMES[values]
     return own | {"common": name}, name, common
+
+
+_NAMES: dict[tuple[int, ...], tuple[str, dict[str, Any]]] = {}
+"""Names by the identity of what a common file holds, which stays alive here."""

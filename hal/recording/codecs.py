@@ -25,11 +25,13 @@ __all__ = [
     "Stats",
     "copy_records",
     "column_stats",
+    "merge_stacked",
     "merge_stats",
     "ids_to_units",
     "stats_as_lists",
     "to_units",
     "depth_unit_for",
+    "exchange_flags",
 ]
 
 # Depth files: zstd over the differences of neighbouring pixels, low and high bytes apart.
@@ -244,7 +246,9 @@ def column_stats(values: NDArray[Any]) -> Stats:
         if numbers.size:
             found["min"][k], found["max"][k] = numbers.min(), numbers.max()
             found["mean"][k], found["std"][k] = numbers.mean(), numbers.std()
-            for key, value in zip(_QUANTILES, np.quantile(numbers, list(_QUANTILES.values())), strict=True):
+            constant = numbers[0] if found["min"][k] == found["max"][k] else None  # as most columns of numbers are
+            values = [constant] * 5 if constant is not None else np.quantile(numbers, list(_QUANTILES.values()))
+            for key, value in zip(_QUANTILES, values, strict=True):
                 found[key][k] = value
     return found | {"count": np.array([len(table)], np.int64)}
 
@@ -291,7 +295,11 @@ def merge_stats(parts: Sequence[Mapping[str, Any]]) -> Stats:
     """
     if len(parts) == 1:
         return {key: np.asarray(value) for key, value in parts[0].items()}
-    stacked = {key: np.array([part[key] for part in parts], np.float64) for key in parts[0]}
+    return merge_stacked({key: np.array([part[key] for part in parts], np.float64) for key in parts[0]})
+
+
+def merge_stacked(stacked: Mapping[str, NDArray[Any]]) -> Stats:
+    """Return the same as :func:`merge_stats` for arrays whose first axis is that of the parts."""
     rows = stacked["count"].reshape(-1, *(1,) * (stacked["mean"].ndim - 1))
 
     def average(values: NDArray[Any]) -> NDArray[Any]:
@@ -308,6 +316,27 @@ def merge_stats(parts: Sequence[Mapping[str, Any]]) -> Stats:
         "std": np.sqrt(np.maximum(0.0, average(stacked["std"] ** 2 + stacked["mean"] ** 2) - mean**2)),
         **{key: average(stacked[key]) for key in _QUANTILES},
         "count": stacked["count"].sum(axis=0).astype(np.int64),
+    }
+
+
+def exchange_flags(whole: Stats, old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]) -> Stats:
+    """Return the statistics of a column of 0 and 1 in which some parts have changed.
+
+    Args:
+        whole: Statistics of all parts, before.
+        old: Those of some parts, stacked along a first axis; ``count`` stays.
+        new: The same parts, after the change.
+    """
+    total, counts = whole["count"], old["count"]
+    ones = np.rint(whole["mean"] * total) + np.rint(new["mean"] * counts).sum(0) - np.rint(old["mean"] * counts).sum(0)
+    mean = ones / total
+    return {
+        "min": (ones == total).astype(np.float64),
+        "max": (ones > 0).astype(np.float64),
+        "mean": mean,
+        "std": np.sqrt(np.maximum(0.0, mean - mean**2)),
+        **{key: whole[key] + ((new[key] - old[key]) * counts).sum(0) / total for key in _QUANTILES},
+        "count": total,
     }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError
+from .changing import existing_episodes
 from .dataset import Dataset, Episode, KeptRows
 from .layout import (
     GRID,
@@ -25,7 +26,7 @@ from .layout import (
     put_in_place,
     video_names,
 )
-from .merging import existing_episodes, extract, merge, open_dataset
+from .merging import extract, merge, open_dataset
 from .validation import checked_name, dataset_errors
 from .videos import key_frames
 

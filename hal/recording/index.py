@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+from numpy.typing import NDArray
 from pydantic import Field
 
 from ..errors import DatasetError
 from .about import read_about
+from .codecs import Stats, merge_stacked, merge_stats
 from .layout import CHUNK, DatasetLayout, EpisodePlace, read_json, video_names
 from .validation import CameraName, Feature, Model, dataset_errors
 
 __all__ = [
     "check_next_episode",
+    "merged_stats",
     "next_place",
     "read_entries",
     "read_index",
+    "read_stats",
     "read_tasks",
     "repair_command",
+    "stats_parts",
     "stray_files",
     "validated_info",
 ]
@@ -129,13 +134,70 @@ def stray_files(
     return [path for path in layout.finished() if path not in known]
 
 
-def read_entries(path: Path, *, stats: bool) -> dict[int, dict[str, Any]]:
-    """Return the rows of a file of ``meta/episodes`` by the number of the episode, with or without the statistics."""
+def read_entries(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the rows of a file of ``meta/episodes`` by the number of the episode, without the statistics."""
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
-    names = [name for name in file.schema_arrow.names if stats or not name.startswith("stats/")]
+    names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
     return {row["episode_index"]: row for row in file.read(columns=names).to_pylist()}
+
+
+def read_stats(source: Any, keys: Collection[str] | None = None) -> dict[str, dict[str, NDArray[Any]]]:
+    """Return the statistics in a file of ``meta/episodes``, by column or video and by name, each (episodes, ...).
+
+    Args:
+        source: Path of the file, or its content as an Arrow table.
+        keys: Columns and videos; None for all.
+    """
+    import pyarrow.parquet as pq
+
+    table = source
+    if isinstance(source, Path):
+        with pq.ParquetFile(source) as file:
+            table = file.read([name for name in file.schema_arrow.names if _is_stats(name, keys)], use_threads=False)
+    found: dict[str, dict[str, NDArray[Any]]] = {}
+    for name in table.column_names:
+        if _is_stats(name, keys):
+            _, key, what = name.split("/")
+            values, shape = table[name].combine_chunks(), [len(table)]
+            while hasattr(values, "flatten"):
+                size, values = len(values), values.flatten()
+                shape.append(len(values) // size)
+            found.setdefault(key, {})[what] = values.to_numpy(zero_copy_only=False).reshape(shape)
+    return found
+
+
+def stats_parts(
+    layout: DatasetLayout, keys: Collection[str] | None = None, known: Mapping[Path, Any] | None = None
+) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
+    """Yield the statistics of each column and video in each file of ``meta/episodes``, as :func:`read_stats` does.
+
+    Args:
+        layout: The dataset.
+        keys: Columns and videos; None for all.
+        known: Content of files to use instead of those on the disk.
+
+    Raises:
+        DatasetError: A file is damaged.
+    """
+    for path in sorted(layout.entry(0).parent.parent.glob("*/*.parquet")):
+        with dataset_errors(layout.root, path):
+            yield from read_stats((known or {}).get(path, path), keys).items()
+
+
+def merged_stats(
+    layout: DatasetLayout, keys: Collection[str] | None = None, known: Mapping[Path, Any] | None = None
+) -> dict[str, Stats]:
+    """Return the statistics over all episodes; arguments and errors are those of :func:`stats_parts`."""
+    parts: dict[str, list[Stats]] = {}
+    for key, found in stats_parts(layout, keys, known):
+        parts.setdefault(key, []).append(merge_stacked(found))
+    return {key: merge_stats(found) for key, found in parts.items()}
+
+
+def _is_stats(name: str, keys: Collection[str] | None) -> bool:
+    return name.startswith("stats/") and (keys is None or name.split("/")[1] in keys)
 
 
 def read_tasks(path: Path) -> list[str]:

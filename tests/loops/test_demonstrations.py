@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from demonstrations import is_lifted
+from recording_kit import make_grasps_old
 
 import hal
 from hal.apps import collect, generate, rollout
 from hal.apps.serve_lerobot import ENVIRONMENT, STATE, describe
 from hal.learning.remote import PolicyServer
 from hal.learning.replay import RecordedTrajectory, TrajectoryPlayer
-from hal.recording import Dataset, Episode
+from hal.recording import Dataset, Episode, repair
 
 SOAK = os.environ.get("HAL_SOAK") == "1"
 ENGINES = pytest.mark.parametrize("engine", ["pybullet", "mujoco"] if SOAK else ["mujoco"])
@@ -63,6 +64,19 @@ def test_a_generated_success_is_replayed_as_one(
     monkeypatch.syspath_prepend(Path(__file__).parents[2])
     found = generated(tmp_path / "out", skill, engine, 20 if SOAK else 1)
     assert sum(replayed(one, engine) for one in found) >= 0.95 * len(found)
+
+
+@ENGINES
+def test_a_grasp_that_an_earlier_version_recorded_is_repaired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str
+) -> None:
+    """Such a replay touches the cube at the width of the grasp, and does not press."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[2])
+    generated(tmp_path / "out", "examples.pick:pick", engine, 1)
+    make_grasps_old(tmp_path / "out", width=0.03)
+    assert not replayed(Dataset(tmp_path / "out").episodes[0], engine)
+    assert len(repair(tmp_path / "out")) == 2
+    assert replayed(Dataset(tmp_path / "out").episodes[0], engine)
 
 
 @ENGINES

@@ -242,7 +242,11 @@ def test_nothing_is_recorded_over_episodes_whose_index_is_lost(out: Path, rig: R
     assert left == {path: before[path] for path in left}
 
     (done,) = repair(out)
-    assert done.startswith("the index was rebuilt from 3 episodes; it was wrong: meta/")
+    made = (
+        "meta/stats.json was made again from" if lost == "meta/stats.json" else "the index was rebuilt from 3 episodes"
+    )
+    assert done.startswith(made)
+    assert "; it was wrong: meta/" in done
     check_layout(out)
     assert checked(out) == []
     assert repair(out) == []
@@ -263,6 +267,36 @@ def test_the_index_comes_back_as_it_was(whole: Path, out: Path) -> None:
     assert old["stats"].keys() == new["stats"].keys()
     for key, values in old["stats"].items():
         assert np.allclose(values, new["stats"][key], atol=1e-6), key
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "change"),
+    [
+        ("action", "mean", 1e-3),
+        ("observation.images.wrist", "std", 0.01),
+        ("rig.time.grid", "max", 0.1),
+        ("action", "", 0),
+    ],
+)
+def test_changed_statistics_are_noticed_and_made_again(
+    whole: Path, out: Path, key: str, name: str, change: float
+) -> None:
+    file = out / "meta/stats.json"
+    stats = json.loads(file.read_text())
+    if name:
+        stats[key][name] = (np.array(stats[key][name]) + change).tolist()
+    else:
+        del stats[key]
+    file.write_text(json.dumps(stats))
+    (error,) = checked(out)
+    assert error.startswith("meta/stats.json: ")
+    assert key in error
+    (done,) = repair(out)
+    assert key in done
+    assert checked(out) == []
+    old, new = index_files(whole)["stats"], index_files(out)["stats"]
+    assert old.keys() == new.keys()
+    assert all(np.allclose(values, new[key], atol=1e-9) for key, values in old.items())
 
 
 def test_an_index_that_lists_fewer_episodes_than_there_are(out: Path, rig: Rig) -> None:

@@ -19,6 +19,7 @@ import hal
 from hal.errors import CommandError, DeviceNotFound, HalError
 from hal.recording import Dataset, Recorder, dataset, recover, repair
 from hal.recording.checking import check_dataset
+from hal.recording.exporters import export
 
 
 @pytest.fixture(scope="module")
@@ -323,6 +324,13 @@ def test_infrared_and_segmentation_are_recorded_on_request(tmp_path: Path) -> No
     assert infrared[0].dtype == np.uint8
     assert np.abs(infrared[0].astype(float) - drawn[0].infrared).mean() < 6.0
     assert np.ptp(infrared[0]) > 30
+    with np.load(export(out, "npz", tmp_path / "npz").path / "episode_000000.npz") as file:
+        assert np.array_equal(file["camera_segmentation"], numbers)
+        assert np.array_equal(file["camera_infrared"], infrared)
+    small_ones = export(out, "zarr", tmp_path / "zarr", size=(32, 24)).path / "data"
+    for name, kind in (("scene_infrared", "|u1"), ("scene_segmentation", "<i4")):
+        head = json.loads((small_ones / name / ".zarray").read_text())
+        assert (head["shape"], head["dtype"]) == ([episode.length, 24, 32, 1], kind)
     for camera, stream in (("scene", "depth"), ("wrist", "segmentation"), ("wrist", "infrared")):
         with pytest.raises(DeviceNotFound):
             episode.pictures(camera, stream)
