@@ -116,11 +116,11 @@ def change_episodes(layout: DatasetLayout, changes: Mapping[int, EpisodeChange])
     """Change episodes of a dataset that is locked (:func:`open_to_change`); all of them or, on an error, none."""
     if not changes:
         return
-    folder, moves = layout.change, []
+    folder, moves = layout.change, list[tuple[str, str]]()
 
-    def put(write: Callable[[Path], object], target: Path) -> None:
+    def put(target: Path, write: Callable[..., object], *content: Any) -> None:
         new = folder / f"{len(moves):06d}{target.suffix}"
-        write(new)
+        write(new, *content)
         moves.append((new.name, str(target.relative_to(layout.root))))
 
     folder.mkdir()
@@ -128,34 +128,34 @@ def change_episodes(layout: DatasetLayout, changes: Mapping[int, EpisodeChange])
         places = {number: EpisodePlace.of(number, read_about(layout, number)) for number in changes}
         for file in sorted({place.data[0] for number, place in places.items() if changes[number].columns}):
             first = {number: place.data[1] for number, place in places.items() if place.data[0] == file}
-            put(lambda new, file=file, first=first: _write_rows(layout, file, first, changes, new), layout.data(file))
-        old, new_ones = {}, {}
+            put(layout.data(file), _write_rows, layout, file, first, changes)
+        before, after = {}, {}
         for path in sorted({layout.entry(place.entry) for place in places.values()}):
             with dataset_errors(layout.root, path):
-                old[path] = _read_entries(path)
-                new_ones[path] = _changed_entries(old[path], changes)
-            put(lambda new, table=new_ones[path]: write_table(new, table), path)
+                before[path] = _read_entries(path)
+                after[path] = _changed_entries(before[path], changes)
+            put(path, write_table, after[path])
         for number, change in changes.items():
             data = read_json(layout.about(number)) | change.about
-            put(lambda new, data=data: write_json(new, data, indent=None), layout.about(number))
+            put(layout.about(number), write_json, data, None)
         if keys := {key for change in changes.values() for key in change.columns}:
-            stats = _changed_stats(layout, keys, old, new_ones)
-            put(lambda new: write_json(new, stats), layout.stats)
-        put(lambda new: _copy(layout.info, new), layout.info)  # last, and new, so that the change is noticed
+            put(layout.stats, write_json, _changed_stats(layout, keys, before, after))
+        put(layout.info, _copy, layout.info)  # last, and new, so that the change is noticed
         write_json(folder / MOVES, moves)
     except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            layout.remove(folder)
         raise
     move_files(layout, folder)
 
 
-def _copy(source: Path, target: Path) -> None:
-    shutil.copyfile(source, target)
-    sync_to_disk(target)
+def _copy(new: Path, source: Path) -> None:
+    shutil.copyfile(source, new)
+    sync_to_disk(new)
 
 
 def _write_rows(
-    layout: DatasetLayout, file: int, first: Mapping[int, int], changes: Mapping[int, EpisodeChange], new: Path
+    new: Path, layout: DatasetLayout, file: int, first: Mapping[int, int], changes: Mapping[int, EpisodeChange]
 ) -> None:
     """Write a file of rows with the changed values; ``first`` has the place of each episode's first row in it."""
     import pyarrow as pa

@@ -246,9 +246,9 @@ def column_stats(values: NDArray[Any]) -> Stats:
         if numbers.size:
             found["min"][k], found["max"][k] = numbers.min(), numbers.max()
             found["mean"][k], found["std"][k] = numbers.mean(), numbers.std()
-            constant = numbers[0] if found["min"][k] == found["max"][k] else None  # as most columns of numbers are
-            values = [constant] * 5 if constant is not None else np.quantile(numbers, list(_QUANTILES.values()))
-            for key, value in zip(_QUANTILES, values, strict=True):
+            constant = found["min"][k] == found["max"][k]  # as many numbers are, and the quantiles take long
+            levels = numbers[:1].repeat(5) if constant else np.quantile(numbers, list(_QUANTILES.values()))
+            for key, value in zip(_QUANTILES, levels, strict=True):
                 found[key][k] = value
     return found | {"count": np.array([len(table)], np.int64)}
 

@@ -294,7 +294,8 @@ class _OpenVideo:
         wanted = round((number - 0.5) / (fps * time_base))
         for frame in self._container.decode(self._stream):
             if frame.pts >= wanted:
-                return self._reformatter.reformat(frame, format="rgb24").to_ndarray()
+                found: Any = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
+                return np.asarray(found, np.uint8)
         return None
 
 
