@@ -83,7 +83,7 @@ class _ReadMemory:
 
 
 def _bytes(arrays: Mapping[str, NDArray[Any]]) -> int:
-    return sum(values.nbytes for values in arrays.values())
+    return sum(values.nbytes + 256 for values in arrays.values())  # an array takes some bytes of its own
 
 
 _MEMORY = _ReadMemory(500_000_000)
@@ -104,7 +104,7 @@ def _group_ends(path: Path, version: tuple[int, int] | None) -> list[int]:
     return list(accumulate(found.row_group(k).num_rows for k in range(found.num_row_groups)))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def _read_groups(path: Path, version: tuple[int, int] | None, groups: range) -> Any:
     """Return some row groups of a file, which short episodes share."""
     import pyarrow.parquet as pq
@@ -237,7 +237,9 @@ class Episode:
             values = (column.flatten() if shape else column).to_numpy(zero_copy_only=False)
             if str(values.dtype) != feature["dtype"] or values.size != self.length * int(np.prod(shape)):
                 raise self._wrong(path, f"{key} is not {feature['dtype']} {feature['shape']} in every row")
-            found[current_key(key)] = values.reshape(-1, *shape)
+            own = np.array(values.reshape(-1, *shape))  # no view of rows that other episodes share
+            own.flags.writeable = False
+            found[current_key(key)] = own
         _MEMORY.add(self, "columns", _bytes(found))
         return found
 

@@ -319,7 +319,13 @@ class DatasetLayout:
 
     def partials(self) -> list[Path]:
         """Return all partial folders, oldest first."""
-        return sorted(self.episodes.glob("*.partial"))
+        return sorted(self._folders(".partial"))
+
+    def _folders(self, ending: str) -> list[Path]:
+        """Return what is in ``episodes/`` with this ending; far quicker than glob among 10,000 episodes."""
+        with contextlib.suppress(FileNotFoundError):
+            return [self.episodes / name for name in os.listdir(self.episodes) if name.endswith(ending)]
+        return []
 
     @property
     def interrupted(self) -> list[Path]:
@@ -376,7 +382,7 @@ class DatasetLayout:
 
     def sweep(self) -> None:
         """Remove folders whose removal was interrupted."""
-        for gone in self.episodes.glob("*.removed"):
+        for gone in self._folders(".removed"):
             shutil.rmtree(gone, ignore_errors=True)
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import random
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +61,7 @@ def test_an_episode_has_the_metadata_of_its_source(made: Path) -> None:
 def test_columns_of_a_long_dataset_do_not_fill_the_memory(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second, third = Dataset(made).episodes
     before = first.columns
-    size = sum(values.nbytes for values in before.values())
+    size = dataset._bytes(before)
     monkeypatch.setattr(dataset, "_MEMORY", dataset._ReadMemory(2 * size))
     for episode in (second, third):
         episode.__dict__.pop("columns", None)
@@ -71,6 +74,28 @@ def test_columns_of_a_long_dataset_do_not_fill_the_memory(made: Path, monkeypatc
     assert "columns" in third.__dict__
     assert first.columns is not before
     assert np.array_equal(first.columns["action"], found["action"])
+
+
+def test_pictures_are_read_in_any_order_by_threads_and_forked_processes(made: Path) -> None:
+    episode = Dataset(made).episodes[0]
+    expected = {camera: list(episode.frames(camera)) for camera in CAMERAS}
+
+    def is_right(seed: int) -> bool:
+        dice = random.Random(seed)
+        rows = [(dice.choice(CAMERAS), dice.randrange(episode.length)) for _ in range(40)]
+        return all(np.array_equal(episode.frame(camera, row), expected[camera][row]) for camera, row in rows)
+
+    assert is_right(0), "the videos are open now"
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(is_right, range(1, 5)))
+    children = []
+    for seed in (5, 6):
+        if (child := os.fork()) == 0:
+            os._exit(0 if is_right(seed) else 1)
+        children.append(child)
+    assert is_right(7), "while they read, too"
+    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
+    assert is_right(8)
 
 
 def test_rows_are_at_their_times_and_nothing_is_missing(made: Path) -> None:

@@ -71,6 +71,7 @@ def test_a_recorder_switches_rigs(part: Path) -> None:
     assert one.stamps["grid"][0] == two.stamps["grid"][0] == 0.0, "each has a clock of its own"
     assert np.array_equal(one.columns["action"][:6], two.columns["action"][:6])
     assert all(one.info[key] is two.info[key] for key in ("rig", "features")), "in memory once"
+    assert len(list(part.glob("episodes/common-*.json"))) == 1, "and on the disk"
 
 
 def test_episodes_are_renumbered_and_nothing_else_changes(part: Path, tmp_path: Path) -> None:
