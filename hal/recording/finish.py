@@ -151,7 +151,8 @@ def write_table(path: Path, table: Any, *, keep_schema: bool = False) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
-    pq.write_table(table, beside, use_dictionary=False, write_statistics=False, store_schema=keep_schema)
+    lean: dict[str, Any] = {"use_dictionary": False, "write_statistics": False, "compression": "zstd"}
+    pq.write_table(table, beside, store_schema=keep_schema, **lean)
     sync_to_disk(beside)
     beside.replace(path)
     sync_to_disk(path.parent)
