@@ -1,8 +1,8 @@
 """Calibrate a camera on the hand or beside the arm, with a printed board.
 
-python apps/calibrate.py board --out board.pdf
-python apps/calibrate.py --sim --config panda_calibration --camera wrist --auto
-python apps/calibrate.py --real --config my_rig.yaml --camera wrist --auto
+hal calibrate board --out board.pdf
+hal calibrate --sim --config panda_calibration --camera wrist --auto
+hal calibrate --real --config my_rig.yaml --camera wrist --auto
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ VIEWS = 20
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``calibrate``."""
     made = argparse.ArgumentParser(
-        prog="calibrate",
+        prog="hal calibrate",
         description="Calibrate a camera on the hand or beside the arm, with a printed board.",
         epilog="To print the board: calibrate board --out board.pdf. Ctrl-C stops the arm.",
     )
@@ -69,7 +69,7 @@ def add_board_options(group: argparse._ActionsContainer) -> None:
 
 def board_parser() -> argparse.ArgumentParser:
     """Return the parser of ``calibrate board``."""
-    made = argparse.ArgumentParser(prog="calibrate board", description="Write a page with the board, to scale.")
+    made = argparse.ArgumentParser(prog="hal calibrate board", description="Write a page with the board, to scale.")
     add_board_options(made)
     made.add_argument("--out", required=True, metavar="FILE", help=".pdf or .png to write")
     return made

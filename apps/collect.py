@@ -1,7 +1,7 @@
 """Collect demonstrations: drive episode after episode into a dataset; simulated and real, the same program.
 
-python apps/collect.py --sim --episodes 10 --task "lift the cube" --out data/lift
-python apps/collect.py --real --config my_rig.yaml --episodes 10 --task "lift the cube" --out data/lift
+hal collect --sim --episodes 10 --task "lift the cube" --out data/lift
+hal collect --real --config my_rig.yaml --episodes 10 --task "lift the cube" --out data/lift
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DEMO_DRIVES_HOME = (
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``collect``."""
     made = argparse.ArgumentParser(
-        prog="collect",
+        prog="hal collect",
         description="Collect demonstrations: the scene is reset, you drive, and each episode is saved as a success or "
         "a failure, or discarded.",
         epilog="--pad demo plays two demonstrations for the places that --seed 0 gives the first two episodes of a new "

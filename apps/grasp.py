@@ -1,8 +1,8 @@
 """Find an object on the table and grasp it: in simulation and on the real arm, the same program.
 
-python apps/grasp.py --sim
-python apps/grasp.py --sim --object duck --picture plan.png
-python apps/grasp.py --real --config my_rig.yaml --gentle
+hal grasp --sim
+hal grasp --sim --object duck --picture plan.png
+hal grasp --real --config my_rig.yaml --gentle
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="grasp",
+        prog="hal grasp",
         description="Find an object on the table, grasp it across its narrowest way, lift it and hold it.",
         epilog="Ctrl-C stops the arm; the fingers keep what they hold. The exit status is 1 if the grasp failed.",
     )

@@ -1,7 +1,7 @@
 """Play a recorded episode back through the servo: in simulation and on the real arm, the same program.
 
-python apps/replay.py data/demo --episode 0 --sim
-python apps/replay.py data/demo --episode 0 --speed 0.5 --real --config my_rig.yaml
+hal replay data/demo --episode 0 --sim
+hal replay data/demo --episode 0 --speed 0.5 --real --config my_rig.yaml
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MANY_MISSED = 0.01
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="replay",
+        prog="hal replay",
         description="Replay a recorded episode through the servo, and report the deviation from the recording.",
         epilog="Ctrl-C stops the arm. The exit status is 1 if the episode was not replayed to its end.",
     )

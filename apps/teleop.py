@@ -1,7 +1,7 @@
 """Drive an arm from a browser or with a gamepad: in simulation and on the real arm, the same program.
 
-python apps/teleop.py --sim
-python apps/teleop.py --real --config my_rig.yaml
+hal teleop --sim
+hal teleop --real --config my_rig.yaml
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["TeleopRun", "main", "parser"]
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``teleop``."""
     made = argparse.ArgumentParser(
-        prog="teleop",
+        prog="hal teleop",
         description="Drive an arm from a browser or with a gamepad, simulated or real.",
         epilog="Ctrl-C stops the arm and ends the program.",
     )

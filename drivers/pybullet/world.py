@@ -61,7 +61,7 @@ RESIDUAL = {"fine": 1e-7, "coarse": 3e-6}
 """The solver stops once no speed changes by more than the root of this in an iteration, m/s or rad/s: 0.3 and 1.7 mm/s.
 
 "fine" is PyBullet's own, and needed while fingers move slowly or hold something. With "coarse" a step takes less time,
-and an arm follows less exactly: ``benchmarks/world_tick.py`` prints both."""
+and an arm follows less exactly."""
 
 
 LEAST_HZ = 100.0

@@ -34,7 +34,7 @@ _COMMON = (
     "robot_type",
     "versions",
 )
-"""Entries of the common file; ``recipe`` is that of ``info``, where ``hal-generate`` keeps it."""
+"""Entries of the common file; ``recipe`` is that of ``info``, where ``hal generate`` keeps it."""
 
 
 class _Camera(Model):

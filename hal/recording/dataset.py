@@ -537,7 +537,7 @@ class Dataset:
         repaired = False
         with contextlib.suppress(DatasetError):  # reported when the episode is read
             repaired = "grasps" in self.episodes[0].info
-        what = "only proven ones were repaired" if repaired else "hal-dataset repair closes those that can be proven"
+        what = "only proven ones were repaired" if repaired else "hal dataset repair closes those that can be proven"
         return (
             *self._notes,
             f"recorded by an earlier version, without {GRIP_FORCE}: a grasp of a script or a skill is the width of its "

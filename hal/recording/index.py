@@ -47,7 +47,7 @@ class _Info(Model):
 
 def repair_command(layout: DatasetLayout) -> str:
     """Return the command that repairs a dataset."""
-    return f"hal-review {shlex.quote(str(layout.root))} --repair"
+    return f"hal review {shlex.quote(str(layout.root))} --repair"
 
 
 def validated_info(data: Any) -> dict[str, Any]:

@@ -219,11 +219,11 @@ def test_the_suggested_command_recovers_an_unfinished_episode(tmp_path: Path) ->
         kill_writer(recorder)
         with pytest.raises(HalError):
             recorder.save(wait=True)
-    with pytest.raises(CommandError, match="1 was not finished; finish with: hal-review ") as caught:
+    with pytest.raises(CommandError, match="1 was not finished; finish with: hal review ") as caught:
         Dataset(out)
     words = shlex.split(str(caught.value).partition("with: ")[2])
     done = subprocess.run(
-        [sys.executable, "-m", "hal.apps.review", *words[1:]], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "hal.apps.main", *words[1:]], capture_output=True, text=True, timeout=60
     )
     assert "recovered as episode 0" in done.stdout, done.stderr
     assert len(Dataset(out)) == 1
