@@ -99,11 +99,11 @@ class Reader:
             options.setdefault("pad", str(find_data(*TOUR)))
         rig = self._open(*arguments, **options)
         self.rigs.append(rig)
-        whole: Callable[[float], Iterator[Any]] = rig.clock.rate
+        whole: Callable[..., Iterator[Any]] = rig.clock.rate
 
-        def rate(hz: float) -> Iterator[Any]:
+        def rate(*arguments: Any, **options: Any) -> Iterator[Any]:
             ours = sys._getframe(1).f_code.co_filename.endswith(".md")
-            return itertools.islice(whole(hz), TURNS) if ours else whole(hz)
+            return itertools.islice(whole(*arguments, **options), None if not ours else TURNS)
 
         rig.clock.rate = rate  # of this rig only
         return rig

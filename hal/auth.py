@@ -1,6 +1,7 @@
-"""Who may connect: pages that this server sent, addressed by a name of this machine, with the token of the link.
+"""Who may connect to a page: pages that this server sent, addressed by a name of this machine, with the link's token.
 
-Also the console's address in the forms that people and browsers use: link, ssh tunnel, names of this machine.
+The guard of the console and of the 3D view. Also the console's address in the forms that people and browsers use: link,
+ssh tunnel, names of this machine.
 """
 
 from __future__ import annotations
@@ -50,11 +51,15 @@ class Authenticator:
         return origin is not None and host is not None and origin.lower() == f"http://{host.lower()}"
 
     def is_valid_token(self, offered: str | None) -> bool:
-        """Whether the offered subprotocols contain the right token. Takes the same time for every wrong one."""
+        """Whether the offered subprotocols contain the token."""
         protocols = [part.strip() for part in (offered or "").split(",")]
         if len(protocols) != 2 or protocols[0] != PROTOCOL:
             return False
-        return hmac.compare_digest(protocols[1].encode(errors="surrogateescape"), self._token)
+        return self.is_token(protocols[1])
+
+    def is_token(self, offered: str) -> bool:
+        """Whether this is the token. Takes the same time for every wrong one."""
+        return hmac.compare_digest(offered.encode(errors="surrogateescape"), self._token)
 
 
 def is_loopback(address: str) -> bool:

@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from hal.drivers.web.auth import Authenticator, host_names, is_loopback, page_link, ssh_tunnel
+from hal.auth import Authenticator, host_names, is_loopback, page_link, ssh_tunnel
 
 TOKEN = "Zm9v-Y_mFy"
 
