@@ -25,7 +25,7 @@ from .about import split_about
 from .codecs import Stats, column_stats, copy_records, merge_stacked, merge_stats, stats_as_lists
 from .dataset import Dataset, Episode
 from .finish import entries_table, entry_row, last_row, new_info, stats_of, stats_row, tasks_table, write_table
-from .index import read_entries, read_stats, read_tasks
+from .index import read_entries, read_stats, read_table, read_tasks
 from .layout import GROUP, VIDEO_MB, DatasetLayout, EpisodePlace, video_key, video_names, write_json
 from .validation import dataset_errors
 from .videos import VideoPart, can_be_joined, join_videos
@@ -64,7 +64,7 @@ class DatasetBuilder:
         self.starts = [0, *accumulate(source.episode.length for source in sources)]
         """Number of each episode's first row in the whole dataset; then of all rows."""
         self._entries = lru_cache(maxsize=2 * _THREADS)(read_entries)
-        self._tables = lru_cache(maxsize=2 * _THREADS)(read_stats_table)
+        self._tables = lru_cache(maxsize=2 * _THREADS)(_read_stats)
         self._tasks = lru_cache(maxsize=None)(read_tasks)
         self._writing = threading.Lock()
         self._places: dict[str, list[tuple[int, int]]] = {}
@@ -295,12 +295,9 @@ class DatasetBuilder:
                     waiting = []
 
 
-def read_stats_table(path: Path) -> tuple[Any, dict[int, int]]:
+def _read_stats(path: Path) -> tuple[Any, dict[int, int]]:
     """Return the statistics in a file of ``meta/episodes`` as an Arrow table, and the row of each episode in it."""
-    import pyarrow.parquet as pq
-
-    with pq.ParquetFile(path) as file:
-        table = file.read(use_threads=False)
+    table = read_table(path)
     names = [name for name in table.column_names if name.startswith("stats/")]
     return table.select(names), {number: row for row, number in enumerate(table["episode_index"].to_pylist())}
 

@@ -22,7 +22,7 @@ from .codecs import column_stats, exchange_flags, stats_as_lists
 from .dataset import Dataset
 from .finish import last_row, move_files, recover_all, write_table
 from .foreign import is_foreign
-from .index import merged_stats, read_stats
+from .index import merged_stats, read_stats, read_table
 from .layout import (
     MOVES,
     SUCCESS,
@@ -132,7 +132,7 @@ def change_episodes(layout: DatasetLayout, changes: Mapping[int, EpisodeChange])
         before, after = {}, {}
         for path in sorted({layout.entry(place.entry) for place in places.values()}):
             with dataset_errors(layout.root, path):
-                before[path] = _read_entries(path)
+                before[path] = read_table(path)
                 after[path] = _changed_entries(before[path], changes)
             put(path, write_table, after[path])
         for number, change in changes.items():
@@ -188,13 +188,6 @@ def _write_rows(
             writer.write_table(table.slice(begin, size), row_group_size=size)
             begin += size
     sync_to_disk(new)
-
-
-def _read_entries(path: Path) -> Any:
-    import pyarrow.parquet as pq
-
-    with pq.ParquetFile(path) as file:
-        return file.read(use_threads=False)
 
 
 def _changed_stats(

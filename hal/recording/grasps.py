@@ -56,6 +56,7 @@ def find_closings(episode: Episode) -> Iterator[Closing]:
     source = columns.get(SOURCE, np.zeros(rows, np.int64))
     scripted = ~np.isin(source, [SOURCES.index("person"), SOURCES.index("policy")])
     for k in (k for k, name in enumerate(names) if name.split(".")[-1] == "gripper"):
+        lead = names[k].removesuffix("gripper")
         edges = np.flatnonzero(np.abs(np.diff(targets[:, k])) > 1e-6) + 1
         for first, end in zip([0, *edges], [*edges, rows], strict=True):
             target, width = targets[first, k], widths[first:end, k]
@@ -64,23 +65,24 @@ def find_closings(episode: Episode) -> Iterator[Closing]:
             if closes and len(resting) and widths[resting, k].min() < target + _ARRIVED:
                 last = resting[widths[resting, k] < target + _ARRIVED]
                 beyond = bool((widths[last, k] < target - _ARRIVED).any())
-                carried = _carried_object(episode, names[k].rpartition(".")[0], int(last[0]), int(end))
+                carried = _carried_object(episode, lead, int(last[0]), int(end))
                 proof = "the fingers closed beyond it" if beyond else f"{carried} was carried" if carried else ""
                 yield Closing(k, int(first), int(end), float(target), proof)
 
 
-def _carried_object(episode: Episode, arm: str, first: int, end: int) -> str:
-    """Return the name of an object that moved with an arm's tcp between two rows; empty if there is none."""
+def _carried_object(episode: Episode, lead: str, first: int, end: int) -> str:
+    """Return the name of an object that moved with a tcp between two rows; empty if there is none.
+
+    ``lead`` is what names of the arm's numbers begin with: empty for the only arm, else ``left.``.
+    """
     columns = episode.columns
-    lead = f"{arm}." if arm else ""
-    names = episode.names("observation.tcp")
-    place = names.index(f"{lead}x") if f"{lead}x" in names else 0
+    place = episode.names("observation.tcp").index(f"{lead}x")
     tcp = columns["observation.tcp"][first:end, place : place + 7].astype(np.float64)
     base = next(
         (
             Pose(robot["base_position"], robot["base_orientation"])
             for robot in episode.info["rig"]["resolved"].get("robots", ())
-            if not arm or robot["name"] == arm
+            if lead in ("", f"{robot['name']}.")
         ),
         Pose(),
     )
@@ -129,13 +131,12 @@ def repair_grasps(layout: DatasetLayout, episodes: Collection[Episode]) -> list[
         except DatasetError:  # a damaged episode stays as it is, and is reported by the check
             continue
         proven = [closing for closing in found if closing.proof]
+        rest = [closing for closing in found if not closing.proof]
         closed += [(episode.number, closing) for closing in proven]
-        unknown += [(episode.number, closing) for closing in found if not closing.proof]
-        about = {"closed": [_as_json(each) for each in proven], "unknown": [_as_json(c) for c in found if not c.proof]}
+        unknown += [(episode.number, closing) for closing in rest]
+        about = {"closed": list(map(_as_json, proven)), "unknown": list(map(_as_json, rest))}
         changes[episode.number] = EpisodeChange({"grasps": about}, _closed_columns(episode, proven) if proven else {})
     change_episodes(layout, changes)
-    if not changes:
-        return []
     lines = [f"{_many(closed)}, recorded as the width of the object, became a closed hand"] if closed else []
     if unknown:
         lines.append(

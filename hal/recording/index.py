@@ -23,6 +23,7 @@ __all__ = [
     "read_entries",
     "read_index",
     "read_stats",
+    "read_table",
     "read_tasks",
     "repair_command",
     "stats_parts",
@@ -143,22 +144,24 @@ def read_entries(path: Path) -> dict[int, dict[str, Any]]:
     return {row["episode_index"]: row for row in file.read(columns=names).to_pylist()}
 
 
-def read_stats(source: Any, keys: Collection[str] | None = None) -> dict[str, dict[str, NDArray[Any]]]:
+def read_table(path: Path) -> Any:
+    """Return a file of ``meta/episodes`` as an Arrow table."""
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as file:
+        return file.read(use_threads=False)
+
+
+def read_stats(table: Any, keys: Collection[str] | None = None) -> dict[str, dict[str, NDArray[Any]]]:
     """Return the statistics in a file of ``meta/episodes``, by column or video and by name, each (episodes, ...).
 
     Args:
-        source: Path of the file, or its content as an Arrow table.
+        table: The file's content as an Arrow table.
         keys: Columns and videos; None for all.
     """
-    import pyarrow.parquet as pq
-
-    table = source
-    if isinstance(source, Path):
-        with pq.ParquetFile(source) as file:
-            table = file.read([name for name in file.schema_arrow.names if _is_stats(name, keys)], use_threads=False)
     found: dict[str, dict[str, NDArray[Any]]] = {}
     for name in table.column_names:
-        if _is_stats(name, keys):
+        if name.startswith("stats/") and (keys is None or name.split("/")[1] in keys):
             _, key, what = name.split("/")
             values, shape = table[name].combine_chunks(), [len(table)]
             while hasattr(values, "flatten"):
@@ -183,7 +186,8 @@ def stats_parts(
     """
     for path in sorted(layout.entry(0).parent.parent.glob("*/*.parquet")):
         with dataset_errors(layout.root, path):
-            yield from read_stats((known or {}).get(path, path), keys).items()
+            table = known[path] if known and path in known else read_table(path)
+            yield from read_stats(table, keys).items()
 
 
 def merged_stats(
@@ -194,10 +198,6 @@ def merged_stats(
     for key, found in stats_parts(layout, keys, known):
         parts.setdefault(key, []).append(merge_stacked(found))
     return {key: merge_stats(found) for key, found in parts.items()}
-
-
-def _is_stats(name: str, keys: Collection[str] | None) -> bool:
-    return name.startswith("stats/") and (keys is None or name.split("/")[1] in keys)
 
 
 def read_tasks(path: Path) -> list[str]:
