@@ -51,10 +51,15 @@ def generated(out: Path, skill: str, engine: str, episodes: int, *more: str) -> 
     return [one for one in found if one.success]
 
 
+def opened(engine: str) -> hal.Rig:
+    """Open a simulated rig in lock-step, without cameras and pad."""
+    bare = {"cameras": {}}
+    return hal.open("panda_table", sim=True, clock="lock_step", pad="none", engine=engine, overrides=bare)
+
+
 def replayed(episode: Episode, engine: str) -> bool:
     """Return whether a replay from the recorded scene does to the cube what the recording did, within 1 cm."""
-    options = {"cameras": {}}
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", engine=engine, overrides=options) as rig:
+    with opened(engine) as rig:
         arm = rig.robots["panda"]
         player = TrajectoryPlayer(rig, arm, RecordedTrajectory.from_episode(episode, arm))
         player.approach()
@@ -87,13 +92,11 @@ def test_a_grasp_that_an_earlier_version_recorded_is_repaired(
 
     monkeypatch.setattr(replay.ReplayRun, "run", run_and_look)
     out = str(tmp_path / "out")
-    options = {"cameras": {}}
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", engine=engine, overrides=options) as rig:
-        with Recorder(rig, out) as recorder:
-            recorder.source = lambda: "program"
-            recorder.start()
-            assert grasp_it(rig, np.random.default_rng(0))
-            recorder.save(True)
+    with opened(engine) as rig, Recorder(rig, out) as recorder:
+        recorder.source = lambda: "program"
+        recorder.start()
+        assert grasp_it(rig, np.random.default_rng(0))
+        recorder.save(True)
     make_grasps_old(Path(out), width=0.03)
     play = [out, *BARE, "--set", "simulation.clock=lock_step", "--engine", engine]
     assert replay.main(play) == dataset.main(["repair", out]) == replay.main(play) == 0
