@@ -25,7 +25,7 @@ from hal.driver import Setpoint
 from hal.drivers.pybullet.engine import load_pybullet
 from hal.drivers.pybullet.gripper import PyBulletGripper
 from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import RESIDUAL, PyBulletWorld
+from hal.drivers.pybullet.world import SOLUTION, PyBulletWorld
 
 TABLE = ((0.5, 0.0, -0.3), (0.4, 0.6, 0.3))
 SMALL = (0.02, 0.02, 0.02)
@@ -106,13 +106,13 @@ def raw(count: int, hz: float) -> tuple[Any, dict[str, Callable[[], object]]]:
     }
 
 
-def follow(residual: float, hz: float, ticks: int) -> tuple[float, float]:
+def follow(solution: dict[str, Any], hz: float, ticks: int) -> tuple[float, float]:
     """Return the greatest distance of a joint from its set-point, mrad, and the median time of a step, us."""
     arm = panda()
     world = PyBulletWorld(world_spec(arm, physics_hz=hz))
     driver = PyBulletRobot(arm, world)
     driver.open()
-    world.client.setPhysicsEngineParameter(solverResidualThreshold=residual)
+    world.client.setPhysicsEngineParameter(**solution)
     worst, times = 0.0, []
     for _ in range(ticks):
         q, dq = motion(world.t)
@@ -154,8 +154,8 @@ def main() -> None:
     for name, cells in table.items():
         print(f"{name:>18}" + "".join(f"{cell:>24}" for cell in cells))
     print("\nthe arm alone      follows within     step")
-    for name, residual in RESIDUAL.items():
-        worst, step = follow(residual, arguments.hz, ticks)
+    for name, solution in SOLUTION.items():
+        worst, step = follow(solution, arguments.hz, ticks)
         print(f"{name:>18}{worst:11.3f} mrad{step:8.1f} us")
 
 

@@ -34,6 +34,8 @@ HARD_CONTACT = (0.02, 1.0)
 """Time constant, s, and damping ratio of contacts without a stiffness: MuJoCo's own."""
 HARD_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 """How much of a contact's ideal force acts: little of it is lost, so that fingers do not sink into what they hold."""
+PAD_IMPEDANCE = (0.99, 0.999, 0.001, 0.5, 2.0)
+"""The same between a gripper's pad and what it holds."""
 CARRIED = 5
 """Group of the shapes of objects that are attached to an arm, which rays pass through."""
 REACH = 1e4
@@ -50,6 +52,7 @@ class ContactParameters(NamedTuple):
     solref: tuple[float, float]
     solimp: tuple[float, float, float, float, float]
     priority: int
+    solmix: float = 1.0
 
 
 def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactParameters:
@@ -71,6 +74,8 @@ def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactPa
     condim = 6 if contact.rolling_friction > 0.0 else 4 if contact.spinning_friction > 0.0 else 3
     stiffness, damping = contact.contact_stiffness, contact.contact_damping
     if stiffness is None or damping is None:
+        if contact.pad:
+            return ContactParameters(friction, condim, (2.0 * h, 1.0), PAD_IMPEDANCE, 0, 1e3)
         return ContactParameters(friction, condim, HARD_CONTACT, HARD_IMPEDANCE, 0)
     mass = mass or 1.0
     ratio = max(SOFTEST, 2.0 * (stiffness * h + damping) * h / mass)
@@ -85,7 +90,7 @@ def add_pairs(spec: Any, bodies: Collection[Body]) -> None:
         spec.delete(pair)
     for a, k, b, m, friction in friction_pairs(bodies):
         one, other = spec.geom(f"{a.link_path(k)}/0"), spec.geom(f"{b.link_path(m)}/0")
-        first = max((one, other), key=lambda shape: shape.priority)
+        first = max((one, other), key=lambda shape: (shape.priority, shape.solmix))
         spin, roll = (max(one.friction[place], other.friction[place]) for place in (1, 2))
         for first_shape, second_shape in itertools.product(range(a.solids[k]), range(b.solids[m])):
             spec.add_pair(
