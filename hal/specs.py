@@ -113,7 +113,7 @@ class GripperSpec:
     @property
     def width_min(self) -> float:
         """Width when closed on nothing, m: the pads of some grippers do not meet."""
-        return self.travel[0][1]
+        return max(0.0, self.width_at(0.0))
 
     def finger_positions(self, width: float) -> list[float]:
         """Return the position of each finger joint, rad or m, at a width, m."""
