@@ -436,7 +436,7 @@ def _summary(kept: Sequence[SavedEpisode], root: Path, discarded: int, ended: st
         f"{marks.count(True)} succeeded, {marks.count(False)} failed{unmarked}, {discarded} discarded"
     )
     if saved:
-        yield f"view them: hal-review {root}"
+        yield f"view them: hal review {root}"
 
 
 class BackgroundRecorder:

@@ -446,7 +446,7 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
 
 
 def typed_command(name: str) -> str:
-    """Return the command that started the program ``name``: ``hal teleop``, ``hal-teleop`` or ``teleop.py``."""
+    """Return the command that started the program ``name``: ``hal teleop``, ``hal teleop`` or ``teleop.py``."""
     command, *rest = name.split()
     typed = Path(sys.argv[0]).name
     if typed in ("hal", "main.py") and command != "hal":

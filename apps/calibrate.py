@@ -1,8 +1,8 @@
 """Calibrate a camera on the hand or beside the arm, with a printed board.
 
-python apps/calibrate.py board --out board.pdf
-python apps/calibrate.py --sim --config panda_calibration --camera wrist --auto
-python apps/calibrate.py --real --config my_rig.yaml --camera wrist --auto
+hal calibrate board --out board.pdf
+hal calibrate --sim --config panda_calibration --camera wrist --auto
+hal calibrate --real --config my_rig.yaml --camera wrist --auto
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Pre-flight check of this computer, the arm and the network between them; or a list of pads, cameras, CAN adapters.
 
-python apps/check.py --real --config my_rig.yaml
-python apps/check.py --pads
+hal check --real --config my_rig.yaml
+hal check --pads
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Collect demonstrations: drive episode after episode into a dataset; simulated and real, the same program.
 
-python apps/collect.py --sim --episodes 10 --task "lift the cube" --out data/lift
-python apps/collect.py --real --config my_rig.yaml --episodes 10 --task "lift the cube" --out data/lift
+hal collect --sim --episodes 10 --task "lift the cube" --out data/lift
+hal collect --real --config my_rig.yaml --episodes 10 --task "lift the cube" --out data/lift
 """
 
 from __future__ import annotations

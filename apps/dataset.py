@@ -1,11 +1,11 @@
 """Curate a dataset: list its episodes, delete, mark, re-task, extract or trim some, split it, merge several.
 
-python apps/dataset.py list data/demo --failed
-python apps/dataset.py delete data/demo 3,5-7
-python apps/dataset.py mark data/demo 4 success
-python apps/dataset.py merge data/monday data/tuesday --out data/all
-python apps/dataset.py split data/all --shares train=0.9,val=0.1 --out data/parts
-python apps/dataset.py trim data/all --dry-run
+hal dataset list data/demo --failed
+hal dataset delete data/demo 3,5-7
+hal dataset mark data/demo 4 success
+hal dataset merge data/monday data/tuesday --out data/all
+hal dataset split data/all --shares train=0.9,val=0.1 --out data/parts
+hal dataset trim data/all --dry-run
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
         prog="dataset",
         description="List the episodes of a dataset; delete, mark, re-task, extract or trim some; split and merge.",
         epilog="EPISODES are numbers such as 0,3-5. Pictures and depth are never encoded again; a result replaces the "
-        "dataset when it is complete. hal-review shows an episode.",
+        "dataset when it is complete. hal review shows an episode.",
     )
     commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=typed_command("dataset"))
 

@@ -1,8 +1,8 @@
 """Convert a recording for training: robomimic, diffusion policy (zarr), or plain .npz files.
 
-python apps/export.py data/demo --to robomimic
-python apps/export.py data/demo --to zarr --resize 96x96 --successful-only
-python apps/export.py data/demo --to npz --episodes 0,3-5
+hal export data/demo --to robomimic
+hal export data/demo --to zarr --resize 96x96 --successful-only
+hal export data/demo --to npz --episodes 0,3-5
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Generate a dataset in simulation: seeded episodes of a policy or a scripted skill, on several workers at once.
 
-python apps/generate.py --skill examples.pick:pick --episodes 200 --workers 4 --out data/picks
-python apps/generate.py --policy my_policy:Act --success my_task:done --episodes 1000 --workers 8 --out data/eval
-python apps/generate.py --skill my_skill:stack --episodes 10000 --workers 64 --ray auto --out /shared/stack
+hal generate --skill examples.pick:pick --episodes 200 --workers 4 --out data/picks
+hal generate --policy my_policy:Act --success my_task:done --episodes 1000 --workers 8 --out data/eval
+hal generate --skill my_skill:stack --episodes 10000 --workers 64 --ray auto --out /shared/stack
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _PERIOD = 10.0
 """Time between two lines of progress if the output is not a terminal, s."""
 EXAMPLES = """\
 examples:
-  hal-generate --skill examples.pick:pick --episodes 200 --workers 2 --out data/picks
-  hal-generate --policy my_policy:Act --success my_task:done --episodes 1000 --workers 8 --out data/eval
-  hal-generate --skill my_skill:stack --episodes 10000 --workers 64 --ray auto --out /shared/stack
+  hal generate --skill examples.pick:pick --episodes 200 --workers 2 --out data/picks
+  hal generate --policy my_policy:Act --success my_task:done --episodes 1000 --workers 8 --out data/eval
+  hal generate --skill my_skill:stack --episodes 10000 --workers 64 --ray auto --out /shared/stack
 
 The same command continues an interrupted run, and with a larger --episodes extends a dataset. Episode k has the seed
 --seed + k, and the same rows whatever the number of workers. Until it is complete, the workers' datasets are in

@@ -1,8 +1,8 @@
 """Find an object on the table and grasp it: in simulation and on the real arm, the same program.
 
-python apps/grasp.py --sim
-python apps/grasp.py --sim --object duck --picture plan.png
-python apps/grasp.py --real --config my_rig.yaml --gentle
+hal grasp --sim
+hal grasp --sim --object duck --picture plan.png
+hal grasp --real --config my_rig.yaml --gentle
 """
 
 from __future__ import annotations

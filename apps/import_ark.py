@@ -1,7 +1,7 @@
 """Import Ark's configuration files as a rig's file, with a report of every key.
 
-python apps/import_ark.py global_config.yaml -o config/mine.yaml
-python apps/import_ark.py global_config.yaml --check
+hal import-ark global_config.yaml -o config/mine.yaml
+hal import-ark global_config.yaml --check
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _main(args: argparse.Namespace) -> int:
         print("\nvalid; nothing is written (--check)")
         return 0
     _write(texts, path)
-    program = "python apps/teleop.py" if sys.argv[0].endswith(".py") else "hal-teleop"
+    program = "hal teleop" if sys.argv[0].endswith(".py") else "hal teleop"
     print(f"\nstart: {program} --sim --config {args.out}")
     return 0
 

@@ -1,7 +1,7 @@
 """Find an object on the table and push it to a goal: in simulation and on the real arm, the same program.
 
-python apps/push.py --sim --object cube --goal 0.5 0.0
-python apps/push.py --real --config my_rig.yaml --by 0.1 0.0 --picture plan.png
+hal push --sim --object cube --goal 0.5 0.0
+hal push --real --config my_rig.yaml --by 0.1 0.0 --picture plan.png
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Play a recorded episode back through the servo: in simulation and on the real arm, the same program.
 
-python apps/replay.py data/demo --episode 0 --sim
-python apps/replay.py data/demo --episode 0 --speed 0.5 --real --config my_rig.yaml
+hal replay data/demo --episode 0 --sim
+hal replay data/demo --episode 0 --speed 0.5 --real --config my_rig.yaml
 """
 
 from __future__ import annotations

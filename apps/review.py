@@ -1,9 +1,9 @@
 """Show a dataset: its statistics, an episode as a picture or for the rerun viewer; check and repair it.
 
-python apps/review.py data/demo
-python apps/review.py data/demo --episode 3
-python apps/review.py data/demo --episode 3 --rrd look.rrd
-python apps/review.py data/demo --check
+hal review data/demo
+hal review data/demo --episode 3
+hal review data/demo --episode 3 --rrd look.rrd
+hal review data/demo --check
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["main", "parser"]
 
 LEAVE_OUT = (
-    "restore the files of a damaged episode from a copy, or leave it out with hal-export --episodes; "
+    "restore the files of a damaged episode from a copy, or leave it out with hal export --episodes; "
     "docs/record.md describes how to remove the last one"
 )
 

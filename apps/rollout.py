@@ -1,8 +1,8 @@
 """Run a policy, and record what it does: in simulation and on the real arm, the same program.
 
-python apps/rollout.py --policy my_policy:act --sim
-python apps/rollout.py --policy my_policy:Act --episodes 10 --out data/eval --real --config my_rig.yaml
-python apps/rollout.py --policy ws://gpu:8000 --policy-config droid --task "put the cube on the plate" --sim
+hal rollout --policy my_policy:act --sim
+hal rollout --policy my_policy:Act --episodes 10 --out data/eval --real --config my_rig.yaml
+hal rollout --policy ws://gpu:8000 --policy-config droid --task "put the cube on the plate" --sim
 """
 
 from __future__ import annotations
@@ -205,7 +205,7 @@ def _policy(rig: Rig, robot: Robot, args: argparse.Namespace, config: PolicyConf
 
 @contextlib.contextmanager
 def _lerobot_server(checkpoint: str) -> Iterator[str]:
-    """Start ``hal-serve-lerobot`` in a process of its own, which ends with this one; yield its address."""
+    """Start ``hal serve-lerobot`` in a process of its own, which ends with this one; yield its address."""
     from hal.errors import PolicyError
 
     command = [sys.executable, "-m", "hal.apps.serve_lerobot", checkpoint, "--port", "0", "--until-stdin-ends"]

@@ -1,7 +1,7 @@
 """Serve a policy that was trained with LeRobot on a recording of this package. Runs in LeRobot's own environment.
 
-hal-serve-lerobot runs/demo/checkpoints/last/pretrained_model --port 8000
-hal-rollout --policy ws://127.0.0.1:8000 --sim
+hal serve-lerobot runs/demo/checkpoints/last/pretrained_model --port 8000
+hal rollout --policy ws://127.0.0.1:8000 --sim
 
 LeRobot's environment needs this package without its dependencies, and two small ones:
 pip install --no-deps robot-hal && pip install aiohttp msgpack
@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="serve-lerobot",
-        description="Serve a policy that was trained with LeRobot on a recording of this package, for hal-rollout.",
+        description="Serve a policy that was trained with LeRobot on a recording of this package, for hal rollout.",
         epilog="It runs in LeRobot's environment. There is no password: listen on other addresses only in a network "
         "that you trust.",
     )

@@ -1,7 +1,7 @@
 """Drive an arm from a browser or with a gamepad: in simulation and on the real arm, the same program.
 
-python apps/teleop.py --sim
-python apps/teleop.py --real --config my_rig.yaml
+hal teleop --sim
+hal teleop --real --config my_rig.yaml
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 
 * rest: places the arm at random poses around home, and compares where the plant stands with where it was
   sent; with the plant as the driver's model has it, and with friction and 20 % more mass.
-* tour: the recorded drive through ``hal-teleop``, simulated and emulated; how far apart the ends are, and the largest
+* tour: the recorded drive through ``hal teleop``, simulated and emulated; how far apart the ends are, and the largest
   distance between set-point and plant on the way.
 * ends: an arm at 0.4 rad/s under gravity, whose app is killed, whose host is killed, or whose bus is cut; its greatest
   speed afterwards.

@@ -1,4 +1,4 @@
-"""Episodes per second of ``hal-generate`` with two workers and with one, and what is left after workers were killed.
+"""Episodes per second of ``hal generate`` with two workers and with one, and what is left after workers were killed.
 
     python benchmarks/generate.py [--episodes 200] [--kills 5] [--camera] [--ray]
 

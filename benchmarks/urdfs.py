@@ -1,4 +1,4 @@
-"""Read every URDF file of installed packages, and check a rig with each arm among them by ``hal-teleop --dry-run``.
+"""Read every URDF file of installed packages, and check a rig with each arm among them by ``hal teleop --dry-run``.
 
     python benchmarks/urdfs.py [PACKAGE ...] [--no-rigs]
 
@@ -63,7 +63,7 @@ def longest_arm(urdf: UrdfModel) -> tuple[list[str], str]:
 
 
 def dry_run(path: Path, urdf: UrdfModel) -> str:
-    """Return the outcome of ``hal-teleop --dry-run`` for a rig with the longest arm of a URDF."""
+    """Return the outcome of ``hal teleop --dry-run`` for a rig with the longest arm of a URDF."""
     joints, tip = longest_arm(urdf)
     home = []
     for name in joints:

@@ -1,7 +1,7 @@
 """Pick the cube up by a script: above it, down, close, up.
 
 python examples/pick.py [SEED]
-hal-generate --skill examples.pick:pick --sim --episodes 20 --workers 2 --task "pick the cube" --out data/picks
+hal generate --skill examples.pick:pick --sim --episodes 20 --workers 2 --task "pick the cube" --out data/picks
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def above(pose: hal.Pose) -> hal.Pose:
 
 
 def pick(rig: hal.Rig, random: np.random.Generator) -> bool:
-    """Pick the cube up, and return whether it was lifted: a skill for hal-generate, which resets the scene before."""
+    """Pick the cube up, and return whether it was lifted: a skill for hal generate, which resets the scene before."""
     arm = next(iter(rig.robots.values()))
     start = rig.world.pose("cube")
     approach = random.uniform(0.2, 0.3)  # of the arm's speed, so that the demonstrations differ

@@ -1,6 +1,6 @@
 """Checks before a real arm moves: this computer, the arms and their network, the cameras and their frame rates.
 
-Nothing moves, and nothing stays open. ``hal-check`` prints the results.
+Nothing moves, and nothing stays open. ``hal check`` prints the results.
 """
 
 from __future__ import annotations

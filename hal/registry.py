@@ -134,7 +134,7 @@ class DriverSpec:
     """The same for a real camera."""
     buses: str | None = None
     """"module:function" that yields a line for each adapter that this driver's devices can be connected to, without
-    arguments; ``hal-check --can`` prints them."""
+    arguments; ``hal check --can`` prints them."""
     path_options: frozenset[str] = frozenset()
     """Options that are paths of files; in a rig or a model they are relative to the file that names them."""
     own_process: frozenset[str] = frozenset()

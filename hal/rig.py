@@ -184,7 +184,7 @@ class Rig:
         from .preflight import REALTIME_RIGHT
 
         checked = self.attended and not self.emulated  # the check before a real arm has printed the command
-        remedy = "hal-check prints what allows it" if checked else f"to allow it: {REALTIME_RIGHT}"
+        remedy = "hal check prints what allows it" if checked else f"to allow it: {REALTIME_RIGHT}"
         self.notes.append(f"real-time priority (SCHED_FIFO) is refused: a busy computer delays the servos; {remedy}")
 
     def _start_hosts(self, groups: Sequence[GroupSpec], realtime: bool) -> Host | None:

@@ -245,7 +245,7 @@ class CanBus:
         remedy = "check the adapter and its cable"
         if s.interface != "socketcan":
             remedy += ", and that the library of its vendor is installed; on Linux, most adapters are SocketCAN "
-            remedy += "interfaces (hal-check --can lists them)"
+            remedy += "interfaces (hal check --can lists them)"
         return _lost(where, f"the bus does not work: {error}", remedy, "bus_lost")
 
     # Frames.
@@ -348,7 +348,7 @@ def describe_losses(name: str, channel: str, lost: int, expected: int) -> list[s
     """Return a warning if more than 1 % of the frames that were expected from a device did not come; else nothing."""
     if expected < _FEWEST or lost <= _MANY_LOST * expected:
         return []
-    remedy = "check wiring, termination (120 ohm at both ends), bit rate and bus load: hal-check --real"
+    remedy = "check wiring, termination (120 ohm at both ends), bit rate and bus load: hal check --real"
     return [f"{name}: {100.0 * lost / expected:.1f} % of the frames on {channel} were lost; {remedy}"]
 
 

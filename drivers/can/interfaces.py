@@ -1,6 +1,6 @@
 """CAN interfaces of this computer's kernel: up or down, bit rate and errors, as ``ip -details -json link`` lists them.
 
-For ``hal-check``; the driver itself needs none of it.
+For ``hal check``; the driver itself needs none of it.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ _STATUS_FAULTS: dict[int, tuple[str, str]] = {
     0x3: ("the arm is in a singularity", "end the other program that drives this arm"),
     0x4: (
         "a target is beyond the arm's own limit",
-        "compare the arm's limits with the model's (hal-check --real)",
+        "compare the arm's limits with the model's (hal check --real)",
     ),
     0x5: ("the arm's controller does not reach a motor", f"check the cables along the arm; {_SUPPORT}"),
     0x6: ("a brake is not released", f"{_SUPPORT}; then restart it"),
@@ -140,7 +140,7 @@ def silence_remedy(bus: CanBus, source: str) -> str:
         )
     if bus.settings.key[0] in EMULATED_INTERFACES:
         return emulator_remedy(source)
-    return "check the arm's power, the cable (CAN_H, CAN_L), the termination, and the bit rate: hal-check --real"
+    return "check the arm's power, the cable (CAN_H, CAN_L), the termination, and the bit rate: hal check --real"
 
 
 class PiperLink:

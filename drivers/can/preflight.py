@@ -101,7 +101,7 @@ def _check_interface(settings: BusSettings) -> _Steps:
     found_one = next((one for one in interfaces if one.name == settings.channel), None)
     if found_one is None:
         there = ", ".join(one.name for one in interfaces) or "none"
-        remedy = "plug in the adapter, or correct `channel`; hal-check --can lists what there is"
+        remedy = "plug in the adapter, or correct `channel`; hal check --can lists what there is"
         yield CheckResult(name, "fail", f"there is no CAN interface {settings.channel}; interfaces: {there}", remedy)
         return False
     result = judge_interface(found_one, settings)

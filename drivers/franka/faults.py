@@ -191,7 +191,7 @@ KNOWN_ERRORS = (
         "realtime|real-time",
         "realtime",
         "the client library was denied real-time scheduling",
-        "install a real-time kernel and allow rtprio; hal-check prints the commands",
+        "install a real-time kernel and allow rtprio; hal check prints the commands",
     ),
     # The hand.
     KnownError(
@@ -300,7 +300,7 @@ def fault_of_exception(
             known = NO_HAND
         return known.fault("the robot" if host is None else f"{host}:{port}")
     message = " ".join(text.split()).removeprefix("libfranka: ") or type(error).__name__
-    return Fault("libfranka", _shortened(message), "look at Desk, and run hal-check")
+    return Fault("libfranka", _shortened(message), "look at Desk, and run hal check")
 
 
 def is_connection_lost(error: BaseException) -> bool:

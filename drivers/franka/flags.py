@@ -55,7 +55,7 @@ FLAGS: tuple[str, ...] = (
 The Panda (protocol 5) sends all 41; its library names only the first 37.
 """
 
-_LATE = "run hal-check: late or lost set-points have the same symptom"
+_LATE = "run hal check: late or lost set-points have the same symptom"
 _OTHER = "this driver sends joint set-points only: end the other program, or the Desk task, that moves this arm"
 _DESK = "change that motion where it was created, in Desk; this driver starts none"
 _FREE = "move the arm free by hand with the guiding buttons"
@@ -65,7 +65,7 @@ FLAG_TEXTS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "communication_constraints_violation": (
             "20 set-points in a row did not reach the robot in time",
-            "connect this computer directly to Control's LAN port, end busy programs, and run hal-check",
+            "connect this computer directly to Control's LAN port, end busy programs, and run hal check",
         ),
         # Contact and external forces.
         "joint_reflex": ("the external torque on a joint exceeded its collision threshold", _CONTACT),

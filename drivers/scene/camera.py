@@ -329,7 +329,7 @@ def choose_renderer(scene: RenderScene, name: str = "auto") -> Renderer:
 
 
 def check_pictures(plan: Plan) -> Iterator[CheckResult]:
-    """Draw a picture with each simulated camera of a rig, for ``hal-check``."""
+    """Draw a picture with each simulated camera of a rig, for ``hal check``."""
     assert plan.world is not None
     scene = DrawnWorld(plan.world)
     renderer = choose_renderer(scene, plan.renderer)

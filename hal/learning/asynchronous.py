@@ -97,7 +97,7 @@ class RemotePolicy:
             rig: An open rig.
             client: Connection to the server.
             config: What the policy sees, and what its actions mean. None: as the server describes it, which those of
-                ``hal-serve-lerobot`` do.
+                ``hal serve-lerobot`` do.
             robot: The arm; None for the rig's first. A ``config`` may name others, or several.
             task: The task in words, for policies that follow instructions.
             latency: Simulated time until an answer arrives, s; in lock-step only.

@@ -1,4 +1,4 @@
-"""A worker of ``hal-generate``: makes episodes of a policy or a scripted skill and records them into its own dataset.
+"""A worker of ``hal generate``: makes episodes of a policy or a scripted skill and records them into its own dataset.
 
 Every episode runs in a rig of its own, opened for it, whose clock starts at 0: its rows depend on the recipe and on the
 episode's number only, and not on the episodes that the worker made before.

@@ -1,4 +1,4 @@
-"""Workers of ``hal-generate`` on a Ray cluster (``pip install 'robot-hal[ray]'``)."""
+"""Workers of ``hal generate`` on a Ray cluster (``pip install 'robot-hal[ray]'``)."""
 
 from __future__ import annotations
 

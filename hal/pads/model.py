@@ -289,7 +289,7 @@ def guess_warning(model: PadModel) -> str:
     """Return the warning about a guessed model, with the file to start from."""
     return (
         f"{model.title!r} is an unknown gamepad: its controls are guessed. Upper and left face button may be swapped, "
-        "and a trigger may be a stick. Check each control with hal-check --pads, set 'wireless: false' if it has a "
+        "and a trigger may be a stick. Check each control with hal check --pads, set 'wireless: false' if it has a "
         f"cable, and save this as a model file, {model.name}.yaml, which the rig names (model: {model.name}.yaml):\n"
         f"{model.to_yaml()}"
     )

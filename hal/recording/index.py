@@ -147,7 +147,7 @@ class _About(_Model):
 
 def repair_command(layout: DatasetLayout) -> str:
     """Return the command that repairs a dataset."""
-    return f"hal-review {shlex.quote(str(layout.root))} --repair"
+    return f"hal review {shlex.quote(str(layout.root))} --repair"
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""``hal-check --pads`` as a person starts it, with recorded pads under umockdev, and without any."""
+"""``hal check --pads`` as a person starts it, with recorded pads under umockdev, and without any."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def test_the_tutorial_is_imported_and_teleoperated(tmp_path: Path) -> None:
     )
     assert re.search(r"^\d+ keys: \d+ kept, \d+ changed, \d+ ignored$", done.stdout, re.M)
     assert f"written: {tmp_path / 'mine.yaml'}" in done.stdout
-    assert done.stdout.splitlines()[-1] == "start: python apps/teleop.py --sim --config mine.yaml"
+    assert done.stdout.splitlines()[-1] == "start: hal teleop --sim --config mine.yaml"
     assert sorted(file.name for file in tmp_path.iterdir()) == ["mine.yaml"]
 
     driven = run("teleop.py", "--sim", "--config", "mine.yaml", "--pad", "demo", "--duration", "1.5", cwd=tmp_path)

@@ -1,4 +1,4 @@
-"""``hal-grasp`` and ``hal-push`` on the built-in rig, in lock-step."""
+"""``hal grasp`` and ``hal push`` on the built-in rig, in lock-step."""
 
 from __future__ import annotations
 

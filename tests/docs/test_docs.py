@@ -73,8 +73,8 @@ def test_links_lead_somewhere(document: Path) -> None:
         ("python", "def test_it():\n    assert 1 == 2", AssertionError),
         ("yaml", "robots:\n  arm: {model: pandaa}", ConfigError),
         ("yaml", "robots: {}\nnonsense: 1", AssertionError),
-        ("console", "$ hal-teleop --config panda_table --dry-run\n  robot    panda  with wheels", AssertionError),
-        ("console", "$ hal-teleop --config nowhere --dry-run", AssertionError),
+        ("console", "$ hal teleop --config panda_table --dry-run\n  robot    panda  with wheels", AssertionError),
+        ("console", "$ hal teleop --config nowhere --dry-run", AssertionError),
         ("bash", "make everything", AssertionError),
     ],
 )

@@ -1,4 +1,4 @@
-"""``hal-generate`` as a program: workers and the program itself are killed, and the rows are those of one worker.
+"""``hal generate`` as a program: workers and the program itself are killed, and the rows are those of one worker.
 
 Two kills here; HAL_GENERATE_KILLS=20 does more.
 """

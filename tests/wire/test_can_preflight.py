@@ -1,4 +1,4 @@
-"""hal-check of arms on a CAN bus, against the emulator in this process: what it reports, and the remedy."""
+"""hal check of arms on a CAN bus, against the emulator in this process: what it reports, and the remedy."""
 
 from __future__ import annotations
 

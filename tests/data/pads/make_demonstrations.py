@@ -4,7 +4,7 @@
 
 It is for
 
-    python apps/collect.py --sim --pad demo --episodes 2 --task "lift the cube" --out DIR
+    hal collect --sim --pad demo --episodes 2 --task "lift the cube" --out DIR
 
 A made-up person sits before the simulated arm, sees where the cube lies in the episodes of that command, and does what
 anybody would do with the default mapping: Cross, squeeze L2, drive over the cube, turn the hand as the cube is turned,

@@ -56,13 +56,13 @@ def test_usage_names_the_command_that_was_typed(
     assert run_here(main, *words, "--help").stdout.startswith(f"usage: {usage} [-h]")
 
 
-@pytest.mark.parametrize("command", ["hal-teleop", "teleop.py"])
+@pytest.mark.parametrize("command", ["hal teleop", "teleop.py"])
 def test_usage_of_a_single_program(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", [f"/somewhere/{command}"])
     assert run_here(teleop.main, "--help").stdout.startswith(f"usage: {command} [-h]")
 
 
-@pytest.mark.parametrize("command", ["hal-dataset", "dataset.py"])
+@pytest.mark.parametrize("command", ["hal dataset", "dataset.py"])
 def test_usage_of_a_subcommand(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", [f"/somewhere/{command}"])
     assert run_here(dataset.main, "split", "--help").stdout.startswith(f"usage: {command} split [-h]")

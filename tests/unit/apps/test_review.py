@@ -97,7 +97,7 @@ def test_every_file_is_checked_and_a_lost_index_is_rebuilt(tmp_path: Path) -> No
         done = run(root, *options)
         assert done.returncode == 2
         assert done.stderr.startswith("DatasetError: meta/info.json: is missing")
-        assert f"hal-review {root} --repair" in done.stderr
+        assert f"hal review {root} --repair" in done.stderr
     done = run(root, "--repair")
     assert done.stdout.startswith("the index was rebuilt from 3 episodes"), done.stderr
     video = root / "videos/observation.images.wrist/chunk-000/file-001.mp4"
@@ -129,11 +129,11 @@ def test_a_truncated_episode_is_named_once_and_can_be_left_out(tmp_path: Path, f
     done = run(root, "--repair")
     assert done.returncode == 2
     assert f"cannot be repaired: episode 2: {file}: " in done.stdout
-    assert "leave it out with hal-export --episodes" in done.stdout
-    assert "leave it out with hal-export --episodes" in run(root).stdout
+    assert "leave it out with hal export --episodes" in done.stdout
+    assert "leave it out with hal export --episodes" in run(root).stdout
     done = run(root, "--check")
     assert done.stdout.count(file) == 1
-    assert f"3 episodes checked, 1 problem(s); next: hal-review {root} --repair" in done.stdout
+    assert f"3 episodes checked, 1 problem(s); next: hal review {root} --repair" in done.stdout
 
     assert run_here(export.main, root, "--to", "npz", "--episodes", "0-1").returncode == 0
     for path in [root / "episodes/000002.json", *root.glob("**/chunk-000/file-002.*")]:
@@ -150,6 +150,6 @@ def test_a_damaged_index_is_a_warning(tmp_path: Path, file: str) -> None:
     (root / file).write_bytes((root / file).read_bytes()[:100])
     (warning,) = run(root).stderr.splitlines()
     assert warning.startswith(f"warning: the index is damaged: {file}: cannot be read")
-    assert warning.endswith(f"hal-review {root} --repair")
+    assert warning.endswith(f"hal review {root} --repair")
     assert run(root, "--repair").returncode == 0
     assert run(root).stderr == ""

@@ -192,7 +192,7 @@ def test_the_suggested_command_recovers_an_unfinished_episode(tmp_path: Path) ->
         kill_writer(recorder)
         with pytest.raises(HalError):
             recorder.save(wait=True)
-    with pytest.raises(CommandError, match="1 was not finished; finish with: hal-review ") as caught:
+    with pytest.raises(CommandError, match="1 was not finished; finish with: hal review ") as caught:
         Dataset(out)
     words = shlex.split(str(caught.value).partition("with: ")[2])
     done = subprocess.run(
