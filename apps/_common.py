@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
-from hal.registry import EngineChoice
+from hal.registry import ENGINES
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
@@ -44,7 +44,6 @@ __all__ = [
     "robot_names",
     "run_app",
     "select_robots",
-    "typed_command",
 ]
 
 ACTION_NEEDED = 2
@@ -64,8 +63,9 @@ def add_config_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGro
     flag.add_argument("--real", dest="sim", action="store_false", help="use the real devices")
     rig.add_argument(
         "--engine",
-        choices=get_args(EngineChoice),
-        help="engine of the simulation (default: the rig's; auto: the first of these that is installed)",
+        metavar="NAME",
+        help=f"engine of the simulation: {', '.join(ENGINES)}, auto (the first of these that is installed), or a "
+        "driver with a world (default: the rig's)",
     )
     rig.add_argument(
         "--set",
@@ -412,7 +412,7 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
 
     Args:
         main: Function of the parsed options that returns the exit status.
-        parser: Its ``prog`` is the program's name (``teleop``); the usage shows the command that was typed.
+        parser: Its ``prog`` is the command, such as ``hal teleop``.
         argv: Arguments; None for those of the process.
 
     Returns:
@@ -421,7 +421,6 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
     from hal.errors import HalError
 
     _open_standard_streams()
-    parser.prog = typed_command(parser.prog)
     link = logging.getLogger("hal.console")
     before, link.disabled = link.disabled, True  # the banner prints the link
     try:
@@ -443,15 +442,6 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
         return 130
     finally:
         link.disabled = before
-
-
-def typed_command(name: str) -> str:
-    """Return the command that started the program ``name``: ``hal teleop``, ``hal teleop`` or ``teleop.py``."""
-    command, *rest = name.split()
-    typed = Path(sys.argv[0]).name
-    if typed in ("hal", "main.py") and command != "hal":
-        rest = [command, *rest]
-    return " ".join([typed, *rest])
 
 
 def _failed(message: str) -> int:

@@ -1,8 +1,9 @@
-"""Calibrate a camera on the hand or beside the arm, with a printed board.
+"""Calibrate a camera on the hand or beside the arm, with a printed board; or find where a gripper is closed.
 
 hal calibrate board --out board.pdf
 hal calibrate --sim --config panda_calibration --camera wrist --auto
 hal calibrate --real --config my_rig.yaml --camera wrist --auto
+hal calibrate gripper --real --config my_rig.yaml
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from hal.apps._common import ACTION_NEEDED, add_rig_options, rig_options, run_app
+from hal.apps._gripper_zero import find_zero, gripper_parser
 
 if TYPE_CHECKING:
     from hal.calibration import Board, Calibration, CalibrationSetup, Collector, RigFileOutput
@@ -25,9 +27,10 @@ VIEWS = 20
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``calibrate``."""
     made = argparse.ArgumentParser(
-        prog="calibrate",
+        prog="hal calibrate",
         description="Calibrate a camera on the hand or beside the arm, with a printed board.",
-        epilog="To print the board: calibrate board --out board.pdf. Ctrl-C stops the arm.",
+        epilog="To print the board: hal calibrate board --out board.pdf. To find where a gripper is closed: "
+        "hal calibrate gripper. Ctrl-C stops the arm.",
     )
     add_rig_options(made)
     task = made.add_argument_group("task")
@@ -69,7 +72,7 @@ def add_board_options(group: argparse._ActionsContainer) -> None:
 
 def board_parser() -> argparse.ArgumentParser:
     """Return the parser of ``calibrate board``."""
-    made = argparse.ArgumentParser(prog="calibrate board", description="Write a page with the board, to scale.")
+    made = argparse.ArgumentParser(prog="hal calibrate board", description="Write a page with the board, to scale.")
     add_board_options(made)
     made.add_argument("--out", required=True, metavar="FILE", help=".pdf or .png to write")
     return made
@@ -80,6 +83,8 @@ def main(argv: list[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["board"]:
         return run_app(_print_board, board_parser(), given[1:])
+    if given[:1] == ["gripper"]:
+        return run_app(find_zero, gripper_parser(), given[1:])
     return run_app(_main, parser(), given)
 
 

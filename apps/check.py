@@ -345,7 +345,7 @@ _SHOWN = {"ok": "ok", "warn": "WARN", "fail": "FAIL", "unknown": "unknown"}
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="check",
+        prog="hal check",
         description="Pre-flight check of this computer, the arm and the network between them.",
         epilog="Nothing moves. The exit status is 2 if a check fails, else 0.",
     )

@@ -30,7 +30,7 @@ DEMO_DRIVES_HOME = (
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``collect``."""
     made = argparse.ArgumentParser(
-        prog="collect",
+        prog="hal collect",
         description="Collect demonstrations: the scene is reset, you drive, and each episode is saved as a success or "
         "a failure, or discarded.",
         epilog="--pad demo plays two demonstrations for the places that --seed 0 gives the first two episodes of a new "

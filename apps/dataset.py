@@ -14,7 +14,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app, typed_command
+from hal.apps._common import run_app
 from hal.errors import CommandError
 
 if TYPE_CHECKING:
@@ -32,12 +32,12 @@ NAMES = {mark: name if mark is not None else "-" for name, mark in MARKS.items()
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="dataset",
+        prog="hal dataset",
         description="List the episodes of a dataset; delete, mark, re-task, extract or trim some; split and merge.",
         epilog="EPISODES are numbers such as 0,3-5. Pictures and depth are never encoded again; a result replaces the "
         "dataset when it is complete. hal review shows an episode.",
     )
-    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=typed_command("dataset"))
+    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, what: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=what, description=what[0].upper() + what[1:] + ".")

@@ -28,7 +28,7 @@ _PROGRESS_PERIOD = 0.1
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="export",
+        prog="hal export",
         description="Convert a recording for training. The recording is only read; LeRobot trains on it directly.",
         epilog="The output appears only when it is complete. The exit status is then 0, else 2.",
     )

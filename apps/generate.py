@@ -46,7 +46,7 @@ OUT.parts. The exit status is 0 if the dataset is complete.
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="generate",
+        prog="hal generate",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Generate a dataset in simulation, in lock-step, on several workers at once.",
         epilog=EXAMPLES,
@@ -81,7 +81,19 @@ def parser() -> argparse.ArgumentParser:
         "--ray",
         metavar="ADDRESS",
         help="run the workers on the Ray cluster at this address (auto: the one this computer belongs to; local: start "
-        "one on this computer); its nodes need this package, your modules and the folder --out",
+        "one on this computer); its nodes need this package, your modules, and the folder --out or --upload",
+    )
+    where.add_argument(
+        "--gpus", type=float, default=0.0, metavar="N", help="with --ray: graphics cards of each worker, such as 0.25"
+    )
+    where.add_argument(
+        "--runtime-env", metavar="FILE", help="with --ray: YAML file of Ray's runtime environment for the workers"
+    )
+    where.add_argument(
+        "--upload",
+        metavar="URL",
+        help="workers record into temporary folders, and upload each episode to this address of fsspec, of this run "
+        "alone, such as s3://bucket/run; no folder has to be shared",
     )
     return made
 
@@ -97,13 +109,12 @@ def _main(args: argparse.Namespace) -> int:
     from hal import registry
     from hal.apps._common import check_episode_options, resolve_plan
     from hal.apps._display import StatusLine, list_devices
-    from hal.errors import CommandError, ConfigError
+    from hal.errors import ConfigError
     from hal.learning.generate import LocalWorker, StartWorker, generate, parts_folder
     from hal.recording.layout import require_libraries
 
     check_episode_options(args, "policy", "skill", "reset", "success")
-    if args.workers < 1:
-        raise CommandError(f"--workers must be 1 or more, not {args.workers}")
+    runtime_env = _check_workers(args)
     args.pad, args.viewer, args.console, args.listen = "none", "none", False, None
     cameras = _names(args.cameras)
     where = f"the Ray cluster {args.ray}" if args.ray else "this computer"
@@ -131,25 +142,58 @@ def _main(args: argparse.Namespace) -> int:
         if args.ray:
             from hal.learning.ray_workers import RayCluster
 
-            start_worker = cluster.enter_context(RayCluster(args.ray, args.workers)).start_worker
+            joined = RayCluster(args.ray, args.workers, gpus=args.gpus, runtime_env=runtime_env)
+            start_worker = cluster.enter_context(joined).start_worker
         try:
             made = generate(
                 _recipe(args, plan, cameras),
                 args.out,
                 args.episodes,
                 workers=args.workers,
+                upload=args.upload,
                 start_worker=start_worker,
                 on_progress=_show_progress(line),
                 on_event=lambda text: line.event(f"  {text}"),
             )
         except BaseException:
             line.clear()
-            if any(parts_folder(args.out).glob("*/meta/info.json")):
-                print(f"  finished episodes are in {parts_folder(args.out)}; the same command continues", flush=True)
+            if args.upload or any(parts_folder(args.out).glob("*/meta/info.json")):
+                place = args.upload or parts_folder(args.out)
+                print(f"  finished episodes are in {place}; the same command continues", flush=True)
             raise
     line.clear()
     _print_results(args, made)
     return 0
+
+
+def _check_workers(args: argparse.Namespace) -> dict[str, Any]:
+    """Check the options of the workers; return Ray's runtime environment.
+
+    Raises:
+        CommandError: One is wrong.
+    """
+    import yaml
+
+    from hal.errors import CommandError
+    from hal.learning.uploads import is_address
+
+    if args.workers < 1:
+        raise CommandError(f"--workers must be 1 or more, not {args.workers}")
+    if not 0.0 <= args.gpus < float("inf"):
+        raise CommandError(f"--gpus must be 0 or more, not {args.gpus:g}")
+    if not args.ray and (args.gpus or args.runtime_env):
+        raise CommandError("--gpus and --runtime-env are for --ray")
+    if args.upload and not is_address(args.upload):
+        raise CommandError(f"--upload {args.upload} is no address: write s3://bucket/run, or file:///shared/run")
+    if not args.runtime_env:
+        return {}
+    try:
+        found = yaml.safe_load(Path(args.runtime_env).read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise CommandError(f"--runtime-env {args.runtime_env}: {error}") from error
+    if not isinstance(found, dict):
+        raise CommandError(f"--runtime-env {args.runtime_env} must be a map of keys such as working_dir and pip")
+    return found
 
 
 def _names(text: str | None) -> list[str] | None:
@@ -232,6 +276,8 @@ def describe(progress: GenerateProgress) -> str:
     if progress.judged:
         share = 100 * progress.succeeded / progress.judged
         parts.append(f"{progress.succeeded} succeeded ({share:.0f} % of {progress.judged})")
+    if progress.waiting:
+        parts.append(f"{progress.waiting} worker(s) waiting for a place")
     if progress.restarts:
         parts.append(f"{progress.restarts} worker(s) replaced")
     return ", ".join(parts)

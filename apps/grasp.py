@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="grasp",
+        prog="hal grasp",
         description="Find an object on the table, grasp it across its narrowest way, lift it and hold it.",
         epilog="Ctrl-C stops the arm; the fingers keep what they hold. The exit status is 1 if the grasp failed.",
     )

@@ -3,6 +3,12 @@
 hal teleop --sim
 hal list robots
 hal schema > rig.schema.json
+
+Another package adds a program by an entry point of the group ``hal.apps``, a function of the arguments that returns the
+exit status. A :class:`~hal.HalError` that it raises is printed as a message::
+
+    [project.entry-points."hal.apps"]
+    import-ark = "hal_import_ark.program:main"
 """
 
 from __future__ import annotations
@@ -10,12 +16,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from hal.apps._common import run_app, typed_command
+from hal.apps._common import run_app
 
-__all__ = ["PROGRAMS", "main", "parser"]
+__all__ = ["BESIDE", "GROUP", "PROGRAMS", "main", "parser"]
 
 PROGRAMS = {
     "teleop": "drive an arm: page in a browser, gamepad, terminal, recorded tour",
@@ -30,9 +37,12 @@ PROGRAMS = {
     "grasp": "find an object and grasp it",
     "push": "find an object and push it to a goal",
     "export": "convert a dataset for training",
-    "calibrate": "measure where a camera is",
-    "import-ark": "convert a configuration of Ark",
+    "calibrate": "measure where a camera is, or where a gripper is closed",
 }
+GROUP = "hal.apps"
+"""Group of the entry points of programs that other packages have."""
+BESIDE = {"import-ark": ("convert a configuration of Ark", "packages/import-ark")}
+"""Program of a package beside this one -> what it does, and the package's folder in the repository."""
 LISTS = {
     "robots": ("robots",),
     "cameras": ("sensors", "cameras"),
@@ -45,16 +55,18 @@ LISTS = {
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
     programs = "\n".join(f"  {name:13s} {what}" for name, what in PROGRAMS.items())
+    beside = "\n".join(f"  {name:13s} {what} ({folder})" for name, (what, folder) in BESIDE.items())
     made = argparse.ArgumentParser(
         prog="hal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description=f"programs:\n{programs}\n\n"
         f"  {'list':13s} list built-in files: {', '.join(LISTS)}\n"
-        f"  {'schema':13s} print the JSON schema of a rig's file, for editors",
+        f"  {'schema':13s} print the JSON schema of a rig's file, for editors\n\n"
+        f"programs of other packages:\n{beside}",
         epilog="hal PROGRAM --help shows a program's own options.",
     )
     made.add_argument("--version", action="store_true", help="print the version")
-    made.add_argument("command", nargs="?", choices=[*PROGRAMS, "list", "schema"], metavar="PROGRAM")
+    made.add_argument("command", nargs="?", metavar="PROGRAM")
     made.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...", help="the program's options")
     return made
 
@@ -67,8 +79,6 @@ def main(argv: list[str] | None = None) -> int:
 def _main(args: argparse.Namespace) -> int:
     import hal
 
-    if args.command in PROGRAMS:
-        return int(import_module(f"hal.apps.{args.command.replace('-', '_')}").main(args.arguments))
     if args.version:
         print(f"robot-hal {hal.__version__}")
     elif args.command == "list":
@@ -77,13 +87,41 @@ def _main(args: argparse.Namespace) -> int:
         from hal.config.rigfile import rig_schema
 
         print(json.dumps(rig_schema(), indent=2))
-    else:
+    elif args.command is None:
         parser().print_help()
+    else:
+        return int(_find_program(args.command)(args.arguments))
     return 0
 
 
+def _find_program(name: str) -> Callable[[list[str]], int]:
+    """Return the function of a program: one of :data:`PROGRAMS`, or of an installed package.
+
+    Raises:
+        DriverMissing: The program is in a package that is not installed.
+        CommandError: There is no such program.
+    """
+    if name in PROGRAMS:
+        main: Callable[[list[str]], int] = import_module(f"hal.apps.{name.replace('-', '_')}").main
+        return main
+    from importlib.metadata import entry_points  # slow to import, so only when it is needed
+
+    from hal.config.files import nearest
+    from hal.errors import CommandError, DriverMissing
+
+    for point in entry_points(group=GROUP, name=name):
+        loaded: Callable[[list[str]], int] = point.load()
+        return loaded
+    if name in BESIDE:
+        folder = BESIDE[name][1]
+        message = f"hal {name} is a package of its own: pip install -e {folder}, in the repository of robot-hal"
+        raise DriverMissing(message, code="missing_package")
+    programs = [*PROGRAMS, *BESIDE, *(point.name for point in entry_points(group=GROUP)), "list", "schema"]
+    raise CommandError(f"there is no program {name!r}{nearest(name, set(programs))}", code="unknown_program")
+
+
 def _list(arguments: list[str]) -> int:
-    made = argparse.ArgumentParser(prog=typed_command("hal list"), description="List built-in models and rigs by name.")
+    made = argparse.ArgumentParser(prog="hal list", description="List built-in models and rigs by name.")
     made.add_argument("kinds", nargs="*", metavar="KIND", help=f"{', '.join(LISTS)} (all)")
     kinds = made.parse_args(arguments).kinds or list(LISTS)
     for kind in kinds:

@@ -23,7 +23,7 @@ OPENING = 0.02
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="push",
+        prog="hal push",
         description="Find an object on the table and push it to a goal; what is left is corrected by further pushes.",
         epilog="Ctrl-C stops the arm. The exit status is 1 if the object is not at its goal in the end.",
     )

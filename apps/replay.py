@@ -32,7 +32,7 @@ MANY_MISSED = 0.01
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="replay",
+        prog="hal replay",
         description="Replay a recorded episode through the servo, and report the deviation from the recording.",
         epilog="Ctrl-C stops the arm. The exit status is 1 if the episode was not replayed to its end.",
     )

@@ -37,7 +37,7 @@ _MARK = {True: "success", False: "failure", None: "-"}
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="review",
+        prog="hal review",
         description="Show a dataset: its statistics, one episode as a picture or for rerun; check and repair it.",
         epilog="The dataset is only read, except by --repair. The exit status is 2 if an episode cannot be read or "
         "repaired, or --check finds a problem, else 0.",

@@ -66,7 +66,7 @@ MARKS = {"finish": True, "fail": False}
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="rollout",
+        prog="hal rollout",
         description="Run a policy under the limits and the dead-man of manual driving; count successes and record.",
         epilog="Ctrl-C stops the arm. An episode that the policy ends by an error is a failure, and the next follows; "
         "a real arm waits for a new press of the dead-man. The exit status is 1 if any episode ended so.",
@@ -348,14 +348,20 @@ class RolloutRun:
         return ACTION_NEEDED if failed else ENDED_EARLY if ended or self._reasons() else 0
 
     def _continues_after(self, outcome: PolicyOutcome) -> bool:
-        """Return whether the next episode may begin: after errors of the policy, if a person starts each real arm."""
+        """Return whether the next episode may begin: after errors of the policy, if a person starts each real arm.
+
+        A reset also ends the fault of a simulated arm that something held away from its set-point.
+        """
+        from hal.errors import RobotFault
         from hal.learning.episode import stands_in_world
         from hal.learning.policy import POLICY_STOPS
 
         if outcome.ended not in ("stopped", "error"):
             return True
-        attended = self.deadman is not None or all(stands_in_world(self.rig, arm) for arm in self.robots.values())
-        return attended and (outcome.ended == "error" or outcome.code in POLICY_STOPS)
+        placed = all(stands_in_world(self.rig, arm) for arm in self.robots.values())
+        if placed and isinstance(outcome.error, RobotFault):
+            return True
+        return (placed or self.deadman is not None) and (outcome.ended == "error" or outcome.code in POLICY_STOPS)
 
     def _reconnect(self) -> None:
         """Wait until a policy's server that was lost answers again.

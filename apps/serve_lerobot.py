@@ -35,7 +35,7 @@ LISTENING = "listening at "
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="serve-lerobot",
+        prog="hal serve-lerobot",
         description="Serve a policy that was trained with LeRobot on a recording of this package, for hal rollout.",
         epilog="It runs in LeRobot's environment. There is no password: listen on other addresses only in a network "
         "that you trust.",

@@ -25,7 +25,7 @@ __all__ = ["TeleopRun", "main", "parser"]
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``teleop``."""
     made = argparse.ArgumentParser(
-        prog="teleop",
+        prog="hal teleop",
         description="Drive an arm from a browser or with a gamepad, simulated or real.",
         epilog="Ctrl-C stops the arm and ends the program.",
     )

@@ -1,22 +1,18 @@
-"""Error of hand-eye calibration: simulated cameras against their true pose, and synthetic views with known errors.
-
-python benchmarks/calibration.py [--seeds 3] [--sets 6]
-"""
+"""Error of hand-eye calibration: simulated cameras against their true pose, and synthetic views with known errors."""
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from calibration_kit import CAMERA, CalibrationBench, K, degrees, poses, views
 
 import hal
 from hal.calibration import Calibration, Eye, solve
 
+from .kit import Table
+
+PATHS = ("hal/calibration", "apps/calibrate.py")
 RIGS: dict[str, Eye] = {"panda_calibration": "in-hand", "panda_calibration_held": "to-hand"}
 ARM_ERRORS = (0.0, 2e-4, 5e-4, 1e-3)
 """m; twice as many rad."""
@@ -42,33 +38,34 @@ def error(found: Calibration) -> tuple[float, float, float]:
     return 1e3 * distance, degrees(angle), 1e3 * found.uncertainty.position
 
 
-def show(what: str, results: list[tuple[float, float, float]]) -> None:
-    """Print the range and the mean of each number."""
-    low, high, mean = np.min(results, axis=0), np.max(results, axis=0), np.mean(results, axis=0)
-    cells = [f"{a:.3f} to {b:.3f}, mean {m:.3f}" for a, b, m in zip(low, high, mean, strict=True)]
-    print(f"{what:48}{cells[0]:>28} mm{cells[1]:>28} deg   reported {cells[2]:>28} mm")
+def ranges(results: Sequence[tuple[float, float, float]]) -> Iterator[str]:
+    """Yield the range and the mean of each number."""
+    for a, b, mean in zip(np.min(results, axis=0), np.max(results, axis=0), np.mean(results, axis=0), strict=True):
+        yield f"{a:.3f} to {b:.3f}, mean {mean:.3f}"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=3, help="initial guesses for each simulated camera (%(default)s)")
-    parser.add_argument("--sets", type=int, default=6, help="sets of synthetic views for each error (%(default)s)")
-    arguments = parser.parse_args()
-
-    for name, eye in RIGS.items():
-        show(f"simulated, {eye}, 20 views", [simulated(name, 20, seed) for seed in range(arguments.seeds)])
-        show("  PyBullet's own renderer, 8 views", [simulated(name, 8, 0, "simulation.renderer=tiny")])
-    seeds = range(arguments.sets)
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    columns = ("error, mm", "error, degrees", "standard deviation reported, mm")
+    table = Table("a simulated camera, against its true pose", ("camera", *columns))
+    count, seeds = (8, 1) if quick else (20, 3)
+    for name, eye in list(RIGS.items())[: 1 if quick else None]:
+        table.add(f"{eye}, {count} views", *ranges([simulated(name, count, seed) for seed in range(seeds)]))
+        if not quick:
+            table.add(
+                f"{eye}, PyBullet's renderer, 8 views", *ranges([simulated(name, 8, 0, "simulation.renderer=tiny")])
+            )
+    yield table
+    sets = range(1 if quick else 6)
+    table = Table("15 synthetic views with noise of 0.2 px", ("error of the arm", *columns))
     for arm in ARM_ERRORS:
         for eye in RIGS.values():
-            sets = [views(eye, poses(15, k), noise_px=0.2, arm=arm, seed=k) for k in seeds]
-            show(f"synthetic, {eye}, arm {1e3 * arm:g} mm", [error(solve(one, eye)) for one in sets])
+            seen = [views(eye, poses(15, k), noise_px=0.2, arm=arm, seed=k) for k in sets]
+            table.add(f"{1e3 * arm:g} mm, {eye}", *ranges([error(solve(one, eye)) for one in seen]))
+    yield table
+    table = Table("the same in the hand, arm 0.2 mm off", ("camera matrix", *columns, "the board appears larger by, %"))
     for what, believed in WRONG_K.items():
-        sets = [views("in-hand", poses(15, k), noise_px=0.2, arm=2e-4, seed=k, believed=believed) for k in seeds]
-        found = [solve(one, "in-hand") for one in sets]
-        show(f"synthetic, in-hand, {what}", [error(one) for one in found])
-        print(f"{'':48}the board appears {100 * np.mean([one.uncertainty.scale for one in found]):+.1f} % larger")
-
-
-if __name__ == "__main__":
-    main()
+        seen = [views("in-hand", poses(15, k), noise_px=0.2, arm=2e-4, seed=k, believed=believed) for k in sets]
+        found = [solve(one, "in-hand") for one in seen]
+        table.add(what, *ranges([error(one) for one in found]), 100 * np.mean([one.uncertainty.scale for one in found]))
+    yield table

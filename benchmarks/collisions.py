@@ -1,18 +1,12 @@
-"""Check the verdicts of collisions against PyBullet's, and that motions that would collide are refused or stopped.
-
-    python benchmarks/collisions.py [targets|tour|verdicts|starts|arms|torques|pushes|tick] [--count N]
-
-Each row is a function that returns its numbers, so that the tests run the same with small counts.
-"""
+"""Collisions: verdicts against PyBullet's, refused and stopped motions, and the cost of the check."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +14,6 @@ import numpy as np
 import hal
 from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
 from hal.config import load
-from hal.config.data_files import find_data
 from hal.driver import Reading
 from hal.kinematics.arm import Kinematics
 from hal.kinematics.collision_model import CollisionModel
@@ -28,6 +21,9 @@ from hal.servo.collisions import CollisionGuard
 from hal.servo.servo import Servo
 from hal.specs import BoxSpec, CollisionSpec, RobotSpec
 
+from .kit import Table, compare, timed
+
+PATHS = ("hal/servo/collisions.py", "hal/kinematics/collision_model.py")
 RATE_HZ = 1000.0
 
 TABLE = BoxSpec("table", (0.55, 0.0, -0.025), (0.0, 0.0, 0.0, 1.0), (1.5, 1.0, 0.05))
@@ -130,19 +126,16 @@ def boxes_overlap(model: CollisionModel, i: int, j: int) -> bool | None:
 
 
 _RUNS = 6
-CROWD = tuple(BoxSpec(f"box{k}", (0.75, 0.3 * k - 1.0, 0.1), (0.0, 0.0, 0.0, 1.0), (0.1, 0.1, 0.2)) for k in range(8))
 
 
 class Ticks:
     """A servo of a Panda without a device, which takes every set-point at once."""
 
-    def __init__(self, spec: RobotSpec, guarded: bool, boxes: tuple[BoxSpec, ...], other: RobotSpec | None) -> None:
+    def __init__(self, spec: RobotSpec, guarded: bool) -> None:
         self.servo = Servo(spec, 1.0 / RATE_HZ)
         if guarded:
-            model = CollisionModel([spec, other] if other else [spec], CollisionSpec(boxes=boxes))
-            still = other.home if other else ()
-            others = [lambda: (still, still)] if other else []
-            self.servo.set_guard(CollisionGuard(model, self.servo.smoother, others))
+            model = CollisionModel([spec], CollisionSpec(boxes=(TABLE,)))
+            self.servo.set_guard(CollisionGuard(model, self.servo.smoother, []))
 
     def times(self, start: Sequence[float], kind: Kind, values: Callable[[float], Sequence[float]], count: int) -> Any:
         """Return the times (count,) of the ticks that follow commands from 50 Hz on, us."""
@@ -156,36 +149,31 @@ class Ticks:
                 command = CommandRecord(k + 1, 1, now, now + 0.1, kind, tuple(values(k / RATE_HZ)))
             reading = Reading(now, now, k, servo.smoother.q, servo.smoother.dq)
             inbox = Inbox(command, None, 0, 0, now)
-            began = time.perf_counter_ns()
-            servo.tick(now, reading, inbox)
-            times[k] = 1e-3 * (time.perf_counter_ns() - began)
+            times[k] = 1e6 * timed(lambda reading=reading, inbox=inbox, now=now: servo.tick(now, reading, inbox))
         return times
 
 
-def tick(count: int) -> dict[str, str]:
-    """Return what the check adds to a tick at 1 kHz, us: each tick's least time of some runs, with and without it."""
+def tick(count: int) -> Table:
+    """Return what the check adds to a tick at 1 kHz: each tick's least time of some runs, with and without it."""
     spec = arm("panda")
-    other = replace(spec, name="other", base_position=(0.9, 0.0, 0.0), base_orientation=(0.0, 0.0, 1.0, 0.0))
     low = (0.0, 0.55, 0.0, -2.1, 0.0, 2.65, 0.785)  # the hand points down, over the table
     swing = Kind.JOINT_VELOCITY, lambda t: [0.2 * math.sin(t + k) for k in range(7)]
     circle = Kind.TWIST, lambda t: [0.1 * math.sin(t), 0.1 * math.cos(t), 0, 0, 0, 0, 0]
     press = Kind.TWIST, lambda t: [0.1 * math.sin(2.0 * t), 0.1 * math.cos(2.0 * t), -0.2, 0, 0, 0, 0]
-    motions = {"joint speeds, nothing near": (spec.home, *swing), "twist, nothing near": (spec.home, *circle)}
-    motions["twist along and into the table"] = (low, *press)
-    found = {}
+    motions = {
+        "joint speeds, nothing near": (spec.home, *swing),
+        "twist, nothing near": (spec.home, *circle),
+        "twist along and into the table": (low, *press),
+    }
+    table = Table(
+        "us that the check of the arm and a table adds to a tick", ("", "median", "mean", "p99", "median in all")
+    )
     for name, motion in motions.items():
-        for what, boxes, seen in (
-            ("itself", (TABLE,), None),
-            ("and 8 boxes", (TABLE, *CROWD), None),
-            ("and an arm", (TABLE,), other),
-        ):
-            kinds = (False, (), None), (True, boxes, seen)
-            runs = [[Ticks(spec, *kind).times(*motion, count) for kind in kinds] for _ in range(_RUNS)]
-            without, checked = np.min(runs, axis=0)
-            more = checked - without
-            numbers = f"median +{np.median(more):.1f}, mean +{more.mean():.1f}, p99 +{np.percentile(more, 99):.0f}"
-            found[f"{name}; table, {what}"] = f"{numbers}; {np.median(checked):.0f} in all"
-    return found
+        runs = [[Ticks(spec, guarded).times(*motion, count) for guarded in (False, True)] for _ in range(_RUNS)]
+        without, checked = np.min(runs, axis=0)
+        more = checked - without
+        table.add(name, np.median(more), more.mean(), np.percentile(more, 99), np.median(checked))
+    return table
 
 
 FACING = {
@@ -251,7 +239,7 @@ def drive_at_each_other(model: CollisionModel, start: Sequence[np.ndarray], u: n
 def targets(count: int) -> dict[str, float]:
     """Ask for targets inside the table and inside the arm itself; return how many are refused, and how fast."""
     rng = np.random.default_rng(6)
-    refused, moved, codes = [], 0, {}
+    refused, moved, codes = [], 0, Counter[str]()
     overrides = {"collisions.boxes": ["table"], "robots.panda.workspace": {}, "cameras": {}}
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=overrides) as rig:
         panda = rig.robots["panda"]
@@ -268,7 +256,7 @@ def targets(count: int) -> dict[str, float]:
                 panda.move_to(target, timeout=0.1)
             except (hal.CollisionError, hal.Unreachable) as error:
                 refused.append(time.perf_counter() - began)
-                codes[error.code] = codes.get(error.code, 0) + 1
+                codes[error.code] += 1
             moved += not np.array_equal(panda.state().q_set, before)
     return {
         "targets": count,
@@ -320,130 +308,15 @@ def starts(model_name: str, count: int) -> dict[str, float]:
     return ends
 
 
-def tour(seconds: float) -> dict[str, float]:
-    """Play the recorded drives in simulation; return how near the arm came to anything, and whether it was slowed."""
-    found: dict[str, float] = {}
-    files = {"the tour": "tour.jsonl", "demonstrations": "demonstrations.jsonl"}
-    for what, file in files.items():
-        recording = str(find_data("config", "teleop", file))
-        overrides = {"cameras": {}}
-        with hal.open("panda_table", sim=True, clock="lock_step", pad=recording, overrides=overrides) as rig:
-            panda, samples = rig.robots["panda"], []
-
-            def look(panda: hal.Robot = panda, samples: list[Any] = samples) -> None:
-                state = panda.state()
-                samples.append((panda.collisions.distance(state.q), hal.Limited.COLLISION in state.limited, state.q))
-
-            session = hal.TeleopSession(rig, on_tick=look)
-            session.run(lambda pad, rig=rig: "over" if rig.clock.now() > seconds or not pad.connected else "")
-            distances, slowed, positions = zip(*samples, strict=True)
-            found[f"{what}: nearest, mm"] = round(1e3 * min(distances), 1)
-            found[f"{what}: ticks slowed by a collision"] = sum(slowed)
-            found[f"{what}: turned, rad"] = round(float(np.ptp(np.array(positions), axis=0).max()), 2)
-    return found
-
-
-OVER_THE_TABLE = [0.0, 0.45, 0.0, -2.1, 0.0, 2.55, 0.785]
-"""The hand points down, some 15 cm above the table."""
-
-
-@contextlib.contextmanager
-def over_the_table(engine: str) -> Iterator[tuple[hal.Rig, Callable[[], tuple[float, bool]]]]:
-    """Open a rig whose arm must not touch the table; also yield a function that makes a step.
-
-    It returns the distance of the nearest pair, m, and whether something held the arm back to avoid a collision.
-    """
-    initial = {"robots.panda.initial": OVER_THE_TABLE, "robots.panda.workspace": {}, "cameras": {}}
-    overrides = initial | {"collisions.boxes": ["table"]}
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", engine=engine, overrides=overrides) as rig:
-        panda = rig.robots["panda"]
-        model = panda.collisions.model
-
-        def step() -> tuple[float, bool]:
-            rig.clock.sleep(1 / 240)
-            state = panda.state()
-            model.place(state.q)
-            return float(model.distances().min()), hal.Limited.COLLISION in state.limited
-
-        rig.clock.sleep(0.2)
-        yield rig, step
-
-
-def torques(count: int, engine: str = "pybullet") -> dict[str, float]:
-    """Drive the arm by constant torques, at random or as forces down on the table; return how near it came."""
-    rng = np.random.default_rng(3)
-    nearest, limited = [], 0
-    for k in range(count):
-        with over_the_table(engine) as (rig, step):
-            panda = rig.robots["panda"]
-            force = ([0.0, 0.0, -1.0] + 0.5 * rng.normal(size=3)) * rng.uniform(2.0, 12.0)
-            tau = panda.kinematics.jacobian(OVER_THE_TABLE)[:3].T @ force
-            if k % 2:
-                tau = rng.normal(size=7) * [8.0, 8.0, 8.0, 8.0, 1.5, 1.5, 1.5]
-            seen = []
-            with panda.control(rate_hz=100) as control, contextlib.suppress(hal.MotionStopped):
-                for _ in range(120):
-                    control.send(hal.JointTorque(tau))
-                    seen += [step(), step()]
-            seen += [step() for _ in range(60)]
-        nearest.append(min(distance for distance, _ in seen))
-        limited += any(slowed for _, slowed in seen)
-    return {
-        "drives": count,
-        "nearest of all, mm": round(1e3 * min(nearest), 2),
-        "stopped because of a collision": limited,
-    }
-
-
-def pushes(
-    engine: str = "pybullet", forces: Sequence[float] = (0.0, 5.0, 20.0, 60.0), names: Sequence[str] = ()
-) -> dict[str, str]:
-    """Drive a compliant arm down to the margin of the table, then push it on; return how near it came."""
-    soft = hal.OperationalSpace(stiffness=200.0, rotation_stiffness=20.0)
-    controllers = {"tcp 1000 N/m": hal.OperationalSpace(), "tcp 200 N/m": soft, "joints": hal.JointImpedance()}
-    found = {}
-    for name in names or controllers:
-        controller = controllers[name]
-        for force in forces:
-            with over_the_table(engine) as (rig, step):
-                seen, end = [], "no trip"
-                with rig.robots["panda"].control(rate_hz=50, controller=controller) as control:
-                    for k in range(120):
-                        if k == 80 and force:
-                            rig.world.apply_force("panda", [0.0, 0.0, -force], link="panda_hand", duration=0.5)
-                        try:
-                            control.send(hal.Twist([0.0, 0.0, -0.25 if k < 80 else 0.0]))
-                        except hal.MotionStopped as stop:
-                            end = stop.code
-                        seen += [step()[0] for _ in range(4)]
-            found[f"{name}, pushed with {force:.0f} N"] = f"{1e3 * min(seen):.1f} mm, {end}"
-    return found
-
-
-ROWS = {
-    "targets": lambda count: targets(count or 1000),
-    "tour": lambda count: tour(count or 60),
-    "verdicts": lambda count: {m: verdicts(m, count or 10_000) for m in ("panda", "fr3", "iiwa")},
-    "starts": lambda count: {m: starts(m, count or 1000) for m in ("so101", "panda", "ur5e", "yam", "piper")},
-    "arms": lambda count: arms(count or 100),
-    "torques": lambda count: torques(count or 50),
-    "pushes": lambda count: pushes(),
-    "tick": lambda count: tick(count or 2000),
-}
-
-
-def main() -> None:
-    """Print the rows."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rows", nargs="*", choices=[*ROWS, []], default=[])
-    parser.add_argument("--count", type=int, default=0, help="how many of each; default: as many as documented")
-    options = parser.parse_args()
-    for name in options.rows or ROWS:
-        began = time.perf_counter()
-        for key, value in ROWS[name](options.count).items():
-            print(f"{name:10s} {key}: {value}")
-        print(f"{name:10s} took {time.perf_counter() - began:.1f} s\n")
-
-
-if __name__ == "__main__":
-    main()
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    models = ("panda",) if quick else ("panda", "fr3", "iiwa")
+    poses = 10 if quick else 10_000
+    yield compare(f"verdicts in {poses} random positions", {model: verdicts(model, poses) for model in models})
+    yield compare("`move_to` into the table and into the arm itself", {"": targets(4 if quick else 1000)})
+    models = ("so101",) if quick else ("so101", "panda", "ur5e", "yam", "piper")
+    yield compare(
+        "`move_to(home)` from inside a margin", {model: starts(model, 1 if quick else 60) for model in models}
+    )
+    yield compare("two arms driven at each other at 0.25 m/s", {"": arms(1 if quick else 100)})
+    yield tick(100 if quick else 2000)

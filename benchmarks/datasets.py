@@ -105,5 +105,22 @@ def main() -> None:
         shutil.rmtree(folder)
 
 
+PATHS = ("hal/recording",)
+
+
+def run(quick: bool) -> list[object]:
+    """Return the table: a row for each line that :func:`main` prints."""
+    from contextlib import redirect_stdout
+    from io import StringIO
+    from unittest import mock
+
+    from .kit import Table  # this file is also run by its path
+
+    printed, words = StringIO(), ["--episodes", "100", "--frames", "20"] if quick else []
+    with redirect_stdout(printed), mock.patch("sys.argv", ["datasets", *words]):
+        main()
+    return [Table("datasets of many episodes", ("",), [(line,) for line in printed.getvalue().splitlines()])]
+
+
 if __name__ == "__main__":
     main()

@@ -1,195 +1,125 @@
-"""``RigEnv`` in lock-step beside PyBullet by hand, in several processes, and the freshness of its observations.
+"""``RigEnv`` in lock-step beside PyBullet by hand, and many worlds in processes and threads.
 
-    python benchmarks/gym.py [--seconds 4] [--rounds 5] [--engine mujoco]
-
-Each part has its reference in the same run; rounds alternate and the medians are printed. The references of lock-step
-are those of ``benchmarks/lock_step.py``: PyBullet's own functions for the same scene, one motor command and one reading
-per step, and with cameras PyBullet's own renderer. The goals: 0.55 of PyBullet by hand without a camera, 4 times its
-renderer with two of 256x256, 1.8 times as many steps with two processes as with one, and no observation twice. The last
-rows of the second part are what the machine allowed at the time: two independent environments, and two programs that
-only count.
+Goals: 0.55 of PyBullet by hand without a camera, 4 times its renderer with two of 256x256, and 1.8 times as many steps
+on two cores as on one.
 """
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import os
-import statistics
-import subprocess
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 
-import hal
-from hal import registry
-from hal.learning.gym import RigEnv
+from hal.gym import RigEnv, make_vec
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-from lock_step import CONFIG, POLICY_HZ, by_hand, rate
+from .kit import ENGINES, Table, median, median_ratio, per_second, run_in_turns, sum_of_programs
+from .lock_step import CONFIG, POLICY_HZ, by_hand
 
+PATHS = ("hal/learning/gym.py", "hal/learning/vector.py", "hal/servo", "hal/host", "drivers/pybullet", "drivers/mujoco")
+CORES = len(os.sched_getaffinity(0))
 BARE = ("cameras={}",)
+ALONE = "from benchmarks.gym import *; print(step_alone({engine!r}, {seconds}))"
+Step = Callable[[], None]
 
 
-def make(engine: str, cameras: bool = False) -> RigEnv:
+def make(engine: str = "auto", cameras: bool = False) -> RigEnv:
     """Return one environment in lock-step."""
     return RigEnv(CONFIG, sim=True, engine=engine, rate_hz=POLICY_HZ, overrides=() if cameras else BARE)
 
 
-def actions(start: np.ndarray) -> Callable[[int], np.ndarray]:
-    """Return the motion of ``lock_step.py`` around the joint positions ``start``, rad."""
-    phases = np.arange(start.size)
-
-    def action(turn: int) -> np.ndarray:
-        q = start + 0.05 * np.sin(turn / POLICY_HZ + phases) - 0.05 * np.sin(phases)
-        return np.append(q, 0.0).astype(np.float32)
-
-    return action
-
-
-def stepping(env: RigEnv) -> Callable[[], None]:
-    """Return a function that makes one step of the environment."""
+def stepping(env: RigEnv | gymnasium.vector.VectorEnv) -> Step:
+    """Return a function that makes one step of an environment, or of all of a vector, with ``lock_step``'s motion."""
     seen, _ = env.reset(seed=1)
-    action, turn = actions(seen["q"]), 0
+    count = getattr(env, "num_envs", None)
+    start = seen["q"] if count is None else seen["q"][0]
+    phases, turn = np.arange(start.size), 0
 
     def step() -> None:
         nonlocal turn
         turn += 1
-        env.step(action(turn))
+        q = start + 0.05 * np.sin(turn / POLICY_HZ + phases) - 0.05 * np.sin(phases)
+        action = np.append(q, 0.0).astype(np.float32)
+        env.step(action if count is None else np.tile(action, (count, 1)))
 
     return step
 
 
-def lock_step(engine: str, cameras: bool, seconds: float, rounds: int) -> tuple[float, float, float]:
-    """Return steps/s of RigEnv and of PyBullet by hand, and the median of their ratios."""
-    env = make(engine, cameras)
-    assert env.rig.plan.world is not None
-    reference, disconnect = by_hand(env.rig.plan.world, cameras, every_tick=False)
-    step = stepping(env)
-    pairs = [(rate(step, seconds), rate(reference, seconds)) for _ in range(rounds)]
-    env.close()
-    disconnect()
-    mine, theirs = (statistics.median(values) for values in zip(*pairs, strict=True))
-    return mine, theirs, statistics.median(a / b for a, b in pairs)
-
-
-def together(engine: str, count: int, seconds: float, cameras: bool = False) -> float:
-    """Return the total steps/s of ``count`` in one ``AsyncVectorEnv``; each step waits for the slowest."""
-    envs = gymnasium.vector.AsyncVectorEnv([partial(make, engine, cameras)] * count, context="spawn")
-    try:
-        seen, _ = envs.reset(seed=1)
-        action, turn = actions(seen["q"][0]), 0
-
-        def step() -> None:
-            nonlocal turn
-            turn += 1
-            envs.step(np.tile(action(turn), (count, 1)))
-
-        return count * rate(step, seconds)
-    finally:
-        envs.close()
-
-
-SPINS = """
-import sys, time
-seconds = float(sys.argv[1])
-end, count = time.perf_counter() + seconds, 0
-while time.perf_counter() < end:
-    count += 1
-print(count / seconds)
-"""
-
-
-def alone(engine: str, seconds: float) -> float:
-    """Return steps/s of one independent environment."""
+def step_alone(engine: str, seconds: float) -> float:
+    """Return steps/s of one environment; programs that do nothing else print it."""
     env = make(engine)
-    found = rate(stepping(env), seconds)
+    found = per_second(stepping(env), seconds)
     env.close()
     return found
 
 
-def programs(*command: str) -> Callable[[int, float], float]:
-    """Return a function that sums what independent programs print that run at the same time."""
+def beside_pybullet(seconds: float, rounds: int) -> Table:
+    """Return steps/s of RigEnv on each engine beside PyBullet's by hand."""
+    table = Table(f"steps/s at 20 Hz, medians of {rounds} rounds", ("", "RigEnv", "PyBullet by hand", "ratio"))
+    for cameras, engine in itertools.product((False, True), ENGINES):
+        env, own = make(engine, cameras), make("pybullet", cameras)
+        assert own.rig.plan.world is not None
+        with by_hand(own.rig.plan.world, cameras) as reference:
+            pair = {"ours": stepping(env), "theirs": reference}
+            measures = {key: partial(per_second, step, seconds) for key, step in pair.items()}
+            mine, theirs = run_in_turns(measures, rounds).values()
+        for each in (env, own):
+            each.close()
+        name = f"{engine}, {'two 256x256 RGB-D cameras' if cameras else 'no camera'}"
+        table.add(name, median(mine), median(theirs), median_ratio(mine, theirs))
+    return table
 
-    def measure(count: int, seconds: float) -> float:
-        line = [sys.executable, *command, str(seconds)]
-        running = [subprocess.Popen(line, stdout=subprocess.PIPE, text=True) for _ in range(count)]
-        return sum(float(program.communicate(timeout=seconds + 60.0)[0].split()[-1]) for program in running)
 
-    return measure
-
-
-def scaling(measure: Callable[[int, float], float], seconds: float, rounds: int) -> tuple[float, float, float]:
-    """Return the measure of two, of one, and the median of their ratios."""
-    pairs = [(measure(2, seconds), measure(1, seconds)) for _ in range(rounds)]
-    two, one = (statistics.median(values) for values in zip(*pairs, strict=True))
-    return two, one, statistics.median(a / b for a, b in pairs)
+def memory(processes: Iterable[int]) -> float:
+    """Return the proportional set size of processes, MB."""
+    lines = (line for pid in processes for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines())
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
 
 
-def freshness(driver: str | None, seconds: float) -> tuple[int, int, int]:
-    """Return steps in real time, and those with an old or repeated picture, and with an old or repeated state."""
+def many_worlds(engine: str, worlds: int, seconds: float, rounds: int) -> Table:
+    """Return steps/s of all worlds together, those of ways that make many of them beside one RigEnv."""
+    one, threaded = make(engine), [make(engine) for _ in range(worlds)]
+    vector = make_vec(CONFIG, worlds, sim=True, engine=engine, rate_hz=POLICY_HZ, overrides=BARE)
+    asynchronous = gymnasium.vector.AsyncVectorEnv([partial(make, engine)] * worlds, context="spawn")
+    steps = [stepping(env) for env in threaded]
+    with ThreadPoolExecutor(CORES) as pool:
 
-    def real_time(*_: object, **options: object) -> hal.Rig:
-        return hal.open(CONFIG, sim=True if driver is None else None, driver=driver, clock="real_time", pad="none")
+        def step_threads() -> None:
+            list(pool.map(lambda k: [step() for step in steps[k::CORES]], range(CORES)))
 
-    RigEnv._open = staticmethod(real_time)  # type: ignore[assignment]  # simulated rigs run in lock-step otherwise
-    env = RigEnv(rate_hz=POLICY_HZ, action="twist")
-    steps = old_pictures = old_states = 0
-    try:
-        env.reset(seed=1)
-        last: dict[str, int] = {}
-        last_t = -np.inf
-        end = env.rig.clock.now() + seconds
-        while env.rig.clock.now() < end:
-            sent = env.rig.clock.now()
-            env.step(np.array([0.02, 0, 0, 0, 0, 0, 0], np.float32))
-            assert env.observation is not None
-            stamps = {name: moment.frame.stamp for name, moment in env.observation.cameras.items()}
-            old_pictures += any(stamp.t <= sent or last.get(name) == stamp.seq for name, stamp in stamps.items())
-            last = {name: stamp.seq for name, stamp in stamps.items()}
-            t = env.observation.robots[env.robot.name].stamp.t
-            old_states += t <= sent or t <= last_t
-            last_t = t
-            steps += 1
-    finally:
+        single, all_of_vector, all_of_async = stepping(one), stepping(vector), stepping(asynchronous)
+        measures: dict[str, Callable[[], float]] = {
+            "one RigEnv": lambda: per_second(single, seconds),
+            "make_vec": lambda: worlds * per_second(all_of_vector, seconds),
+            "AsyncVectorEnv": lambda: worlds * per_second(all_of_async, seconds),
+            f"{CORES} threads": lambda: worlds * per_second(step_threads, seconds),
+            f"{CORES} independent programs of one world": lambda: sum_of_programs(
+                CORES, "-c", ALONE.format(engine=engine, seconds=seconds)
+            ),
+        }
+        found = run_in_turns(measures, rounds)
+    processes = {
+        "make_vec": [child.process.pid for child in vector._children],
+        "AsyncVectorEnv": [process.pid for process in asynchronous.processes],
+    }
+    table = Table(f"{engine}: steps/s of {worlds} worlds together", ("", "steps/s", "ratio", "MB a world"))
+    for name, rates in found.items():
+        size = memory(processes[name]) / worlds if name in processes else None
+        table.add(name, median(rates), median_ratio(rates, found["one RigEnv"]), size)
+    for env in (one, vector, asynchronous, *threaded):
         env.close()
-    return steps, old_pictures, old_states
+    return table
 
 
-def main() -> None:
-    """Print all parts."""
-    parser = argparse.ArgumentParser(description="RigEnv beside raw PyBullet, in processes, and its observations")
-    parser.add_argument("--seconds", type=float, default=4.0, help="length of one round (%(default)s)")
-    parser.add_argument("--rounds", type=int, default=5, help="rounds of each (%(default)s)")
-    parser.add_argument("--alone", type=float, metavar="S", help="only print the steps/s of one environment")
-    parser.add_argument("--engine", choices=("auto", *registry.ENGINES), default="auto", help="of the simulated world")
-    args = parser.parse_args()
-    if args.alone is not None:
-        print(alone(args.engine, args.alone))
-        return
-    load = os.getloadavg()[0]
-    print(f"{os.cpu_count()} cores, load {load:.1f}; steps/s at {POLICY_HZ:g} Hz, medians of {args.rounds} rounds")
-    print(f"{'':30s}{'RigEnv':>12s}{'reference':>14s}{'ratio':>8s}{'goal':>8s}")
-    for cameras, name, goal in ((False, "no camera", 0.55), (True, "two 256x256 RGB-D cameras", 4.0)):
-        mine, theirs, ratio = lock_step(args.engine, cameras, args.seconds, args.rounds)
-        print(f"{name:30s}{mine:12.1f}{theirs:14.1f}{ratio:8.2f}{goal:8.2f}", flush=True)
-    for name, measure in (
-        ("two in an AsyncVectorEnv, one", partial(together, args.engine)),
-        ("... with two cameras each", partial(together, args.engine, cameras=True)),
-        ("two programs, one", programs(__file__, "--engine", args.engine, "--alone")),
-        ("... that only count", programs("-c", SPINS)),
-    ):
-        two, one, ratio = scaling(measure, args.seconds, args.rounds)
-        print(f"{name:30s}{two:12.1f}{one:14.1f}{ratio:8.2f}{1.8:8.2f}", flush=True)
-    print("\nin real time: fresh observations")
-    for driver, name in (("mock", "mocks"), (None, "simulation")):
-        steps, pictures, states = freshness(driver, 3.0 * args.seconds)
-        old = f"{pictures} old pictures, {states} old states"
-        print(f"{name:30s}{100.0 * (steps - pictures) / steps:9.1f} %  of {steps} steps; {old}", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    seconds, rounds, worlds = (0.1, 1, 2) if quick else (4.0, 5, 16)
+    if "pybullet" in ENGINES:
+        yield beside_pybullet(seconds, rounds)
+    for engine in ENGINES[:1] if quick else ENGINES:
+        yield many_worlds(engine, worlds, seconds, rounds)

@@ -1,22 +1,16 @@
-"""Policy steps per second in lock-step, through the public interface, beside PyBullet as a user writes it by hand.
-
-    python benchmarks/lock_step.py [--seconds 5] [--only NAME]
+"""Policy steps per second in lock-step, beside PyBullet as a user writes it by hand.
 
 The reference is a short script with PyBullet's own functions: the same bodies in a client of its own with PyBullet's
 default settings, one setJointMotorControlArray, twelve stepSimulation and one getJointStates per policy step. It moves
-the joints directly, so it computes no inverse kinematics for the rows with twists and poses either. The row "motors
-written every tick" is the same script with motors written and joints read at every physics step, as any servo must.
+the joints directly, so it computes no inverse kinematics for the rows with twists and poses either. "Motors written at
+every physics step" is the same script with motors written and joints read at every physics step, as any servo must.
 With two 256x256 RGB-D cameras the script draws with PyBullet's own renderer (TinyRenderer, no shadows).
-
-Both take turns of 0.2 s; the medians over all turns and the median of their ratios are printed.
 """
 
 from __future__ import annotations
 
-import argparse
-import statistics
-import time
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
@@ -26,6 +20,9 @@ import hal
 from hal.drivers.pybullet.loading import loadable_urdf
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
+from .kit import Table, median, median_ratio, per_second, run_in_turns
+
+PATHS = ("hal/servo", "hal/host", "hal/control.py", "hal/kinematics", "drivers/pybullet", "drivers/scene")
 POLICY_HZ = 20.0
 CONFIG = "panda_table"
 TURN = 0.2
@@ -67,8 +64,9 @@ def ours(kind: str, cameras: bool) -> tuple[Step, hal.Rig]:
     return step, rig
 
 
-def by_hand(spec: WorldSpec, cameras: bool, every_tick: bool) -> tuple[Step, Callable[[], None]]:
-    """Return one policy step written with PyBullet's own functions, and what ends the client."""
+@contextlib.contextmanager
+def by_hand(spec: WorldSpec, cameras: bool, every_tick: bool = False) -> Iterator[Step]:
+    """Yield one policy step written with PyBullet's own functions."""
     import pybullet as p
 
     c = p.connect(p.DIRECT)
@@ -113,7 +111,8 @@ def by_hand(spec: WorldSpec, cameras: bool, every_tick: bool) -> tuple[Step, Cal
                 renderer=p.ER_TINY_RENDERER, physicsClientId=c,
             )  # fmt: skip
 
-    return step, lambda: p.disconnect(c)
+    yield step
+    p.disconnect(c)
 
 
 def place_by_hand(p: Any, c: int, body: BodySpec) -> None:
@@ -148,52 +147,28 @@ def load_by_hand(p: Any, c: int, arm: RobotSpec) -> tuple[int, list[int], list[i
     return robot, joints, fingers
 
 
-def rate(step: Step, seconds: float) -> float:
-    """Return steps per second."""
-    done, start = 0, time.perf_counter()
-    while (spent := time.perf_counter() - start) < seconds:
-        step()
-        done += 1
-    return done / spent
-
-
 ROWS = {
     "joint targets": ("joints", False, False),
     "twists": ("twists", False, False),
     "poses": ("poses", False, False),
-    "motors written every tick": ("joints", False, True),
+    "joint targets; motors written at every physics step": ("joints", False, True),
     "two 256x256 RGB-D cameras": ("joints", True, False),
 }
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--seconds", type=float, default=5.0, help="that each row takes (%(default)s)")
-    parser.add_argument("--only", choices=ROWS, action="append", help="this row alone; may be repeated")
-    args = parser.parse_args()
-    asked = []
-    with hal.open(CONFIG, sim=True, clock="lock_step", overrides=["cameras={}"], pad="none") as rig:
-        for _ in range(500):
-            start = time.perf_counter()
-            rig.world.pose("cube")
-            asked.append(time.perf_counter() - start)
-    print(f"rig.world.pose: {1e6 * statistics.median(asked):.1f} us")
-    print(f"{'':34s}{'hal':>12s}{'by hand':>14s}{'ratio':>8s}   policy steps/s, medians")
-    for name in args.only or ROWS:
-        kind, cameras, every_tick = ROWS[name]
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the table."""
+    rounds = 1 if quick else 20
+    table = Table(
+        f"policy steps/s at 20 Hz over 240 Hz, medians of {rounds} turns", ("", "robot-hal", "by hand", "ratio")
+    )
+    for name, (kind, cameras, every_tick) in ROWS.items():
         step, rig = ours(kind, cameras)
         assert rig.plan.world is not None
-        reference, disconnect = by_hand(rig.plan.world, cameras, every_tick)
-        for each in (step, reference):
-            rate(each, TURN)
-        turns = [(rate(step, TURN), rate(reference, TURN)) for _ in range(max(1, round(args.seconds / (2 * TURN))))]
-        mine, theirs = (statistics.median(values) for values in zip(*turns, strict=True))
-        ratio = statistics.median(a / b for a, b in turns)
-        print(f"{name:34s}{mine:12.1f}{theirs:14.1f}{ratio:8.2f}")
-        rig.close()
-        disconnect()
-
-
-if __name__ == "__main__":
-    main()
+        with rig, by_hand(rig.plan.world, cameras, every_tick) as reference:
+            pair = {"ours": step, "theirs": reference}
+            measures = {key: lambda call=call: per_second(call, TURN) for key, call in pair.items()}
+            run_in_turns(measures, 1)
+            mine, theirs = run_in_turns(measures, rounds).values()
+        table.add(name, median(mine), median(theirs), median_ratio(mine, theirs))
+    yield table

@@ -1,17 +1,13 @@
-"""Check straight lines, refusals and speeds of whole motions of the Panda.
+"""Straight lines of the Panda: in the simulated world, and possible ones among random ones.
 
-    python benchmarks/motion.py [lines|checks|speeds|refusals] [--count N] [--engine pybullet|mujoco]
-
-``lines`` follows random lines in the simulated world; ``checks`` plans random lines and follows those that are
-possible; ``speeds`` compares peaks of joint and tcp speeds; ``refusals`` times poses out of reach. Each row is a
-function that returns its numbers, so that the tests run the same with small counts.
+Each table is a function that returns its numbers, so that the tests run the same with small counts.
 """
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import time
+from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -29,6 +25,10 @@ from hal.servo.audit import SetpointAudit
 from hal.servo.path import JointPath
 from hal.servo.servo import Servo
 from hal.specs import LimitsSpec, RobotSpec
+
+from .kit import ENGINES, Table, compare
+
+PATHS = ("hal/motion", "hal/servo/planned.py", "hal/servo/path.py")
 
 Array = NDArray[np.float64]
 TCP_SPEED = 0.25
@@ -182,7 +182,7 @@ def checks(count: int = 1000, seed: int = 1) -> dict[str, Any]:
     dense = PathPlanner(arm, limits.lower, limits.upper, step=STEP / DENSER)
     began = stopped = refused = confirmed = off = 0
     worst = peak = 0.0
-    reasons: dict[str, int] = {}
+    reasons: Counter[str] = Counter()
     times = []
     for _ in range(count):
         q = numbers.uniform(limits.lower, limits.upper)
@@ -194,7 +194,7 @@ def checks(count: int = 1000, seed: int = 1) -> dict[str, Any]:
         except hal.Unreachable as error:
             times.append(time.perf_counter() - before)
             refused += 1
-            reasons[error.code] = reasons.get(error.code, 0) + 1
+            reasons[error.code] += 1
             confirmed += not possible(dense, q, goal)
             continue
         times.append(time.perf_counter() - before)
@@ -206,7 +206,7 @@ def checks(count: int = 1000, seed: int = 1) -> dict[str, Any]:
         off += away > 5e-4 or turned > 5e-3
     return {
         "began": began, "stopped_underway": stopped, "refused": refused, "confirmed": confirmed / max(1, refused),
-        "reasons": reasons, "worst_off": worst, "off": off, "peak_of_limits": peak,
+        "reasons": dict(reasons), "worst_off": worst, "off": off, "peak_of_limits": peak,
         "plan_median_s": float(np.median(times)), "plan_p99_s": float(np.percentile(times, 99)),
     }  # fmt: skip
 
@@ -222,65 +222,8 @@ def possible(planner: PathPlanner, q: Array, goal: list[float]) -> bool:
     return True
 
 
-def speeds() -> dict[str, float]:
-    """Return peaks of ``move_to`` at three speeds: the ratio of two without a tcp limit, and the tcp's with one."""
-    peaks = {}
-    with hal.open("panda_table", driver="mock", overrides=["robots.panda.tcp_speed=3.0"]) as rig:
-        arm = rig.robots["panda"]
-        goal = arm.home + np.array([0.5, 0.15, -0.2, 0.25, 0.15, -0.25, 0.4])
-        log = rig.driver("panda").log
-        for speed, tcp_speed in ((0.02, None), (0.2, None), (1.0, TCP_SPEED)):
-            log.clear()
-            arm.move_to(goal, speed=speed, tcp_speed=tcp_speed)
-            q = np.array([setpoint.q for setpoint in log])
-            dt = 1.0 / rig._local.spec.rate_hz
-            tcp = np.array([arm.kinematics.fk(x)[:3] for x in q])
-            peaks[speed] = float((np.abs(np.diff(q, axis=0)).max(axis=0) / dt / np.array(arm.limits.velocity)).max())
-            fastest = float(np.linalg.norm(np.diff(tcp, axis=0), axis=1).max() / dt)
-            arm.move_to(arm.home, speed=0.5)
-    return {"at_0.02": peaks[0.02], "at_0.2": peaks[0.2], "ratio": peaks[0.2] / peaks[0.02], "tcp_at_1.0": fastest}
-
-
-def refusals(count: int = 1000, seed: int = 1) -> dict[str, Any]:
-    """Move to poses out of reach, in joint space and straight; returns how many were refused, and the times."""
-    numbers = np.random.default_rng(seed)
-    times: dict[bool, list[float]] = {False: [], True: []}
-    moved = 0
-    with hal.open("panda_table", driver="mock") as rig:
-        arm = rig.robots["panda"]
-        for _ in range(count):
-            way, turn = numbers.normal(size=3), numbers.normal(size=4)
-            place = way / np.linalg.norm(way) * numbers.uniform(0.95, 2.0) + [0.0, 0.0, 0.333]
-            for straight in (False, True):
-                before = time.perf_counter()
-                with contextlib.suppress(hal.Unreachable):
-                    arm.move_to(hal.Pose(place, turn), straight=straight)
-                    moved += 1
-                times[straight].append(time.perf_counter() - before)
-        moved += len(rig.driver("panda").log)
-    return {
-        "count": count, "moved": moved,
-        "p99_s": float(np.percentile(times[False], 99)), "straight_p99_s": float(np.percentile(times[True], 99)),
-    }  # fmt: skip
-
-
-ROWS = {"lines": lines, "checks": checks, "speeds": speeds, "refusals": refusals}
-
-
-def main() -> None:
-    """Print the rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("row", nargs="?", choices=[*ROWS], help="one row; all of them by default")
-    parser.add_argument("--count", type=int, help="how many lines or poses")
-    parser.add_argument("--engine", default="pybullet", help="engine of the simulated world, for lines")
-    options = parser.parse_args()
-    for name in [options.row] if options.row else ROWS:
-        arguments: dict[str, Any] = {"count": options.count} if options.count and name != "speeds" else {}
-        if name == "lines":
-            arguments["engine"] = options.engine
-        for key, value in ROWS[name](**arguments).items():  # type: ignore[operator]
-            print(f"{name:10} {key:20} {value:.6g}" if isinstance(value, float) else f"{name:10} {key:20} {value}")
-
-
-if __name__ == "__main__":
-    main()
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    found = {engine: lines(1 if quick else 200, engine) for engine in ENGINES}
+    yield compare("random lines of 5 to 50 cm at 0.25 m/s; m, rad, and shares of the optimal time", found)
+    yield compare("random lines from anywhere", {"": checks(3 if quick else 1000)})

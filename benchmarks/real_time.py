@@ -1,43 +1,37 @@
-"""Real time: missed servo ticks, frame rates, ages of states and frames, with both cameras of the built-in rig.
-
-    python benchmarks/real_time.py [--seconds 20] [--rates 240 1000] [--loaded] [--engine mujoco]
-
-The reference in the same run is the same rig without cameras, and a bare pacer at the same rate that does nothing. With
-``--loaded``: both cameras, with and without as many busy programs as there are processors, with real-time priority,
-where it is refused, and (the reference) where it is not asked for.
-"""
+"""Real time: missed servo ticks, frame rates, ages of states and frames, alone and on a loaded computer."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
-from child_targets import give_up_right
-
 import hal
-from hal import registry
 from hal.histogram import Histogram
 from hal.host.main import PeriodicPace
 
+from .kit import ENGINES, ROOT, Table, ticks_missed
+
+PATHS = ("hal/host", "hal/servo", "drivers/scene", "drivers/pybullet", "drivers/mujoco")
+RATES = (240.0, 1000.0)
+PRIORITIES = ("real-time priority", "not permitted", "off (reference)")
+
 
 def bare(rate_hz: float, seconds: float) -> float:
-    """Return the share of ticks that an empty loop misses in this process."""
+    """Return the share of ticks that an empty loop misses in this process, %."""
     pacer, end = PeriodicPace(1.0 / rate_hz), time.monotonic() + seconds
     turns = 0
     while time.monotonic() < end:
         pacer.wait()
         turns += 1
-    return pacer.missed / (turns + pacer.missed)
+    return 100.0 * pacer.missed / (turns + pacer.missed)
 
 
 @contextlib.contextmanager
@@ -52,92 +46,71 @@ def busy_programs(number: int) -> Iterator[None]:
             program.wait()
 
 
-def run(engine: str, rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) -> dict[str, Any]:
+def drive(engine: str, rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) -> dict[str, Any]:
     """Drive the arm at 50 Hz, and read its state and every frame."""
     overrides = [f"simulation.physics_hz={rate_hz:g}"] + ([] if cameras else ["cameras={}"])
-    with hal.open(
-        "panda_table",
-        sim=True,
-        engine=engine,
-        clock="real_time",
-        overrides=overrides,
-        pad="none",
-        realtime=realtime,
-    ) as rig:
-        arm = rig.robots["panda"]
-        before = next(iter(rig.statistics().values()))
-        ages = Histogram(1e-4, 5000)
-        start = rig.clock.now()
-        with arm.control(rate_hz=50) as control:
+    options: dict[str, Any] = {"clock": "real_time", "pad": "none", "realtime": realtime, "overrides": overrides}
+    with hal.open("panda_table", sim=True, engine=engine, **options) as rig:
+        arm, ages = rig.robots["panda"], Histogram(1e-4, 5000)
+        with arm.control(rate_hz=50) as control, ticks_missed(rig) as host:
             for tick in rig.clock.rate(50):
-                turn = tick.t - start
-                control.send(hal.Twist([0.05 * np.sin(turn), 0.05 * np.cos(turn), 0.0]))
-                state = arm.state(max_age=1.0)
-                ages.add(rig.clock.now() - state.stamp.t)
+                control.send(hal.Twist([0.05 * np.sin(tick.elapsed), 0.05 * np.cos(tick.elapsed), 0.0]))
+                ages.add(rig.clock.now() - arm.state(max_age=1.0).stamp.t)
                 for camera in rig.cameras.values():
                     camera.latest(max_age=5.0)
-                if turn > seconds:
+                if tick.elapsed > seconds:
                     break
-        after = next(iter(rig.statistics().values()))
-        ticks = after["ticks"] - before["ticks"]
-        missed = after["missed"] - before["missed"]
-        return {
-            "missed": missed / (ticks + missed),
-            "period": after["period_s"],
-            "scheduling": after["scheduling"],
-            "age": ages.summary(),
-            "cameras": {name: camera.counts() for name, camera in rig.cameras.items()},
-            "renderer": rig.renderer,
-        }
+        period, age = next(iter(rig.statistics().values()))["period_s"], ages.summary()
+        counts = [camera.counts() for camera in rig.cameras.values()]
+    return {
+        "missed, %": round(host["missed"], 3),
+        "period, ms, p99 and max": f"{1e3 * period['p99']:.2f}, {1e3 * period['max']:.1f}",
+        "age of a state, ms, p50 and p99": f"{1e3 * age['p50']:.1f}, {1e3 * age['p99']:.1f}",
+        "frames/s": ", ".join(f"{each.fps:.1f}" for each in counts),
+        "age of a frame, ms, p50": ", ".join(f"{1e3 * each.age_p50:.1f}" for each in counts),
+    }
 
 
-def loaded(engine: str, rates: list[float], seconds: float) -> None:
-    """Print the missed ticks with and without load, by scheduling; gives up the right to real-time priority."""
-    for asked in ("asked for", "refused", "not asked for"):
-        if asked == "refused":
-            give_up_right()
-        for rate_hz in rates:
-            for number in (0, os.cpu_count() or 1):
+WITHOUT_RIGHT = """
+import json, sys
+from benchmarks.real_time import drive
+from child_targets import give_up_right
+give_up_right()
+print(json.dumps(drive(*json.loads(sys.argv[1]))))
+"""
+
+
+def drive_without_right(*arguments: Any) -> dict[str, Any]:
+    """Return the same for a program that has no right to real-time priority."""
+    command = [sys.executable, "-c", WITHOUT_RIGHT, json.dumps(arguments)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    seconds, engines, rates = (0.5, ENGINES[:1], RATES[:1]) if quick else (10.0, ENGINES, RATES)
+    for engine in engines:
+        found = {}
+        for rate in rates:
+            found[f"{rate:g} Hz, empty loop (reference)"] = {"missed, %": bare(rate, seconds / 2)}
+            found[f"{rate:g} Hz, without cameras"] = drive(engine, rate, seconds, False)
+            found[f"{rate:g} Hz, with both"] = drive(engine, rate, seconds, True)
+        keys = tuple(next(reversed(found.values())))
+        table = Table(f"{engine}: an arm at 50 Hz, two 256x256 RGB-D cameras at 30 Hz", ("servo", *keys))
+        for name, row in found.items():
+            table.add(name, *(row.get(key) for key in keys))
+        yield table
+    columns = ("servo", "busy programs", *(f"{name}: missed, %; period, ms, p99 and max" for name in PRIORITIES))
+    table = Table("both cameras, beside programs that compute all the time", columns)
+    for rate in rates:
+        for number in (0,) if quick else (0, os.cpu_count() or 1):
+            rows = []
+            for priority in PRIORITIES:
                 with busy_programs(number):
-                    found = run(engine, rate_hz, seconds, True, realtime=asked != "not asked for")
-                period, frames = found["period"], [f"{counts.fps:.1f}" for counts in found["cameras"].values()]
-                print(
-                    f"  priority {asked:13s}  {rate_hz:4g} Hz, {number} busy programs: "
-                    f"missed {100 * found['missed']:.3f} %, period ms p99 {1e3 * period['p99']:.2f} "
-                    f"max {1e3 * period['max']:.1f}, frames/s {', '.join(frames)} ({found['scheduling']})",
-                    flush=True,
-                )
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description="missed ticks, frame rates and ages in real time")
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of each run (%(default)s)")
-    parser.add_argument("--rates", type=float, nargs="+", default=[240.0, 1000.0], help="servo rates, Hz")
-    parser.add_argument("--loaded", action="store_true", help="the loaded computer instead")
-    parser.add_argument("--engine", choices=registry.ENGINES, default="auto", help="of the simulated world")
-    args = parser.parse_args()
-    if args.loaded:
-        loaded(args.engine, args.rates, args.seconds)
-        return
-    for rate_hz in args.rates:
-        print(f"\nservo {rate_hz:g} Hz, {args.seconds:g} s each")
-        print(f"  bare pacer            missed {100 * bare(rate_hz, args.seconds / 2):.2f} %")
-        for cameras in (False, True):
-            found = run(args.engine, rate_hz, args.seconds, cameras)
-            name = "with both cameras" if cameras else "without cameras"
-            period, age = found["period"], found["age"]
-            print(
-                f"  {name:20s}  missed {100 * found['missed']:.2f} %, period ms p50 {1e3 * period['p50']:.2f} "
-                f"p99 {1e3 * period['p99']:.2f} max {1e3 * period['max']:.1f}, state age ms p50 {1e3 * age['p50']:.1f} "
-                f"p99 {1e3 * age['p99']:.1f}"
-            )
-            for camera, counts in found["cameras"].items():
-                print(
-                    f"    {camera:18s}  {counts.fps:.1f} frames/s, {counts.dropped} dropped, "
-                    f"age ms p50 {1e3 * counts.age_p50:.1f}  ({found['renderer']})"
-                )
-
-
-if __name__ == "__main__":
-    main()
+                    measure = drive_without_right if priority == "not permitted" else drive
+                    rows.append(measure(ENGINES[0], rate, seconds, True, priority != PRIORITIES[2]))
+            cells = (f"{row['missed, %']}; {row['period, ms, p99 and max']}" for row in rows)
+            table.add(f"{rate:g} Hz", number, *cells)
+    yield table

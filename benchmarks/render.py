@@ -1,22 +1,19 @@
 """Time of a simulated RGB-D frame by each renderer, and time to the first one with and without a mesh cache.
 
-    python benchmarks/render.py [--frames 20] [--config panda_table]
-
-The two renderers take turns in the same run, so that their ratio holds on a busy machine too; times are medians.
-The goal: OpenGL at least 4 times as fast as PyBullet's own renderer at 256 x 256.
+The two renderers take turns, so that their ratio holds on a busy computer too. The goal: OpenGL at least 4 times as
+fast as PyBullet's own renderer at 256 x 256.
 """
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
-import time
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 from hal.config import load
 from hal.drivers.scene.camera import choose_renderer
@@ -25,6 +22,10 @@ from hal.drivers.scene.exposure import camera_pose
 from hal.drivers.scene.renderer import Renderer
 from hal.specs import CameraSpec
 
+from .kit import Table, median, run_in_turns, timed
+
+PATHS = ("drivers/scene", "drivers/pybullet/tiny.py")
+CONFIG = "panda_table"
 SIZES = ((256, 256), (640, 480), (1280, 720))
 FIRST_FRAME = """
 import time, hal, hal.config, pybullet, moderngl
@@ -43,16 +44,9 @@ def sized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
     return replace(camera, width=width, height=height, K=K, streams=("color", "depth"))
 
 
-def timed(renderer: Renderer, world: DrawnWorld, camera: CameraSpec) -> float:
-    """Return the time of one frame, ms."""
-    start = time.perf_counter()
-    renderer.render(camera, camera_pose(world, camera))
-    return (time.perf_counter() - start) * 1e3
-
-
-def first_frame(config: str, clock: str, cache: str) -> float:
+def first_frame(clock: str, cache: str) -> float:
     """Return the time from hal.open, libraries imported, to a frame of every camera, s, in a fresh process."""
-    code = FIRST_FRAME.format(config=config, clock=clock)
+    code = FIRST_FRAME.format(config=CONFIG, clock=clock)
     environment = {**os.environ, "XDG_CACHE_HOME": cache}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, timeout=120
@@ -60,43 +54,31 @@ def first_frame(config: str, clock: str, cache: str) -> float:
     return float(done.stdout.split()[-1])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=20, help="of each renderer, size and camera")
-    parser.add_argument("--config", default="panda_table", help="a rig")
-    arguments = parser.parse_args()
-
-    plan = load(arguments.config, sim=True).resolve()
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    frames, sizes = (1, SIZES[:1]) if quick else (20, SIZES)
+    plan = load(CONFIG, sim=True).resolve()
     assert plan.world is not None
     world = DrawnWorld(plan.world)
-    renderers: dict[str, Renderer] = {
-        "OpenGL": choose_renderer(world, "gl"),
-        "PyBullet's own": choose_renderer(world, "tiny"),
-    }
     start = world.snapshot()  # the frames of the links are computed for each picture
-    print(f"{renderers['OpenGL'].description}; RGB-D, median ms per frame, and their ratio")
-    print(f"{'camera':10} {'size':>10} {'OpenGL':>10} {'own':>10} {'ratio':>7}")
-    for camera in plan.cameras:
-        for width, height in SIZES:
-            view = sized(camera, width, height)
-            times: dict[str, list[float]] = {name: [] for name in renderers}
-            for turn in range(arguments.frames + 1):
-                for name, renderer in renderers.items():
-                    world.show(start)
-                    spent = timed(renderer, world, view)
-                    if turn:  # the first one makes buffers and shaders
-                        times[name].append(spent)
-            ours, own = (statistics.median(values) for values in times.values())
-            print(f"{camera.name:10} {width:>5}x{height:<4} {ours:>10.1f} {own:>10.1f} {own / ours:>7.1f}")
+    renderers: dict[str, Renderer] = {name: choose_renderer(world, name) for name in ("gl", "tiny")}
 
-    print("\nfirst frame of every camera, s after hal.open was called (goal: 5 without the cache, 2 with it)")
-    for clock in ("lock_step", "real_time"):
+    def draw(renderer: Renderer, view: CameraSpec) -> float:
+        world.show(start)
+        return 1e3 * timed(lambda: renderer.render(view, camera_pose(world, view)))
+
+    columns = ("camera, size", renderers["gl"].description, "PyBullet's own renderer", "ratio")
+    table = Table(f"RGB-D, ms, medians of {frames} frames", columns)
+    for camera, (width, height) in itertools.product(plan.cameras, sizes):
+        view = sized(camera, width, height)
+        turns = {name: partial(draw, renderer, view) for name, renderer in renderers.items()}
+        run_in_turns(turns, 1)  # makes buffers and shaders
+        ours, own = (median(times) for times in run_in_turns(turns, frames).values())
+        table.add(f"{camera.name}, {width}x{height}", ours, own, own / ours)
+    yield table
+    table = Table("first frame of every camera, s after hal.open was called", ("", "meshes parsed", "meshes cached"))
+    for clock in ("lock_step",) if quick else ("lock_step", "real_time"):
         with tempfile.TemporaryDirectory() as cache:
-            without = first_frame(arguments.config, clock, cache)
-            files = len(list(Path(cache).rglob("*.npz")))
-            cached = statistics.median(first_frame(arguments.config, clock, cache) for _ in range(3))
-        print(f"{clock:10} meshes parsed {without:5.2f}   cached ({files} files) {cached:5.2f}")
-
-
-if __name__ == "__main__":
-    main()
+            without = first_frame(clock, cache)
+            table.add(clock, without, median(first_frame(clock, cache) for _ in range(1 if quick else 3)))
+    yield table

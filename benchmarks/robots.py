@@ -1,19 +1,10 @@
-"""Every built-in model of an arm in simulation: kinematics, a drive by the recorded tour, and its gripper.
+"""Every built-in model of an arm in simulation: inverse kinematics, the recorded tour, and its gripper.
 
-    python benchmarks/robots.py [MODEL ...] [--poses 100] [--tour 1.0]
-
-Models whose package is not installed are left out, and named. For each model, on each engine:
-
-ik        largest distance of the tcp from the target over random poses, m and rad, and how many were found.
-tour      seconds of the recorded tour of a gamepad, the largest distance of a joint from its set-point, rad, and trips.
-gripper   width when open and when closed on nothing, m.
+Models whose package is not installed are left out, and named.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,13 +12,14 @@ from typing import Any
 import numpy as np
 
 import hal
-from hal import registry
 from hal.config.data_files import find_data, list_data
 from hal.config.files import read_yaml
 from hal.errors import ConfigError, Unreachable
 from hal.types import Trip
 
-ENGINES = [name for name in registry.ENGINES if not registry.missing(name)]
+from .kit import ENGINES, Table
+
+PATHS = ("robots", "hal/kinematics", "drivers/pybullet", "drivers/mujoco")
 TOUR = str(find_data("config", "teleop/tour.jsonl"))
 RATE_HZ = 50
 
@@ -62,7 +54,7 @@ def entries(model: str) -> Iterator[dict[str, Any]]:
         yield {"model": model} | ({"arm": arm} if arm else {})
 
 
-def run(entry: dict[str, Any], engine: str, poses: int = 100, tour: float = 1.0) -> ModelRun:
+def run_model(entry: dict[str, Any], engine: str, poses: int = 100, tour: float = 1.0) -> ModelRun:
     """Return what an arm does alone in a world.
 
     Args:
@@ -118,44 +110,21 @@ def solve_poses(arm: Any, result: ModelRun, count: int) -> None:
         result.position, result.rotation = max(result.position, distance), max(result.rotation, angle)
 
 
-def main() -> int:
-    """Print the table; return 1 if a model misses a goal."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", help="default: all")
-    parser.add_argument("--poses", type=int, default=100)
-    parser.add_argument("--tour", type=float, default=1.0, help="share of the tour")
-    args = parser.parse_args()
-    failures = 0
-    head = f"{'model':15s} {'engine':9s} {'ik':>9s} {'m':>8s} {'rad':>8s} {'tour s':>7s} {'moved m':>8s}"
-    print(f"{head} {'lag rad':>8s} {'open m':>8s} {'closed m':>8s} {'took s':>7s}")
-    for model in args.models or list_data("robots"):
-        for entry in entries(model):
-            name = " ".join(entry.values())
-            for engine in ENGINES:
-                began = time.perf_counter()
-                try:
-                    found = run(entry, engine, args.poses, args.tour)
-                except ConfigError as error:
-                    if not all(problem.code == "missing_package" for problem in error.problems):
-                        raise
-                    print(f"{name:15s} left out: {error.problems[0].message}")
-                    break
-                widths = "{:8.4f} {:8.4f}".format(*found.widths) if found.widths else f"{'-':>8s} {'-':>8s}"
-                good = (
-                    found.found == args.poses
-                    and found.position <= 1e-5
-                    and found.trip is Trip.NONE
-                    and (found.widths is None or found.widths[1] < 2e-3 < 0.02 < found.widths[0])
-                )
-                failures += not good
-                print(
-                    f"{name:15s} {engine:9s} {found.found:4d}/{args.poses:<4d} {found.position:8.1e} "
-                    f"{found.rotation:8.1e} {found.seconds:7.1f} {found.moved:8.3f} {found.lag:8.4f} {widths} "
-                    f"{time.perf_counter() - began:7.1f} {'' if good else 'FAILS ' + found.trip.name}",
-                    flush=True,
-                )
-    return min(failures, 1)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the table."""
+    poses, tour, models = (3, 0.02, ["panda"]) if quick else (100, 1.0, list_data("robots"))
+    columns = ("poses found", "off, m", "rad", "tour, s", "moved, m", "behind, rad", "trip", "gripper open, closed, m")
+    table = Table(f"inverse kinematics of {poses} random poses, the tour, the gripper", ("", *columns))
+    for entry in (entry for model in models for entry in entries(model)):
+        for engine in ENGINES:
+            try:
+                found = run_model(entry, engine, poses, tour)
+            except ConfigError as error:
+                if not all(problem.code == "missing_package" for problem in error.problems):
+                    raise
+                table.add(" ".join(entry.values()), f"left out: {error.problems[0].message}")
+                break
+            widths = ", ".join(f"{width:.4f}" for width in found.widths or ())
+            cells = (found.found, found.position, found.rotation, found.seconds, found.moved, found.lag)
+            table.add(f"{' '.join(entry.values())}, {engine}", *cells, found.trip.name.lower(), widths)
+    yield table

@@ -1,7 +1,5 @@
 """Random target streams through the servo: limits, times to reach held targets, and overshoot.
 
-    python benchmarks/servo_streams.py [count] [--seed N]
-
 Each stream has its own servo rate, command rate (10-1000 Hz), limits (acceleration x 0.1-1, jerk x 0.02-1), start
 (inside, at or beyond a limit) and a mixture of smooth motion, jumps (past the limits too), reversals, broken commands
 and silence, and ends with a target that is held. Only the positions that a driver would receive are judged. The
@@ -13,11 +11,9 @@ from the second.
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
-import statistics
-import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
@@ -27,6 +23,10 @@ from hal.driver import Reading
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import KinematicsSpec, LimitsSpec, RobotSpec
+
+from .kit import Table, median
+
+PATHS = ("hal/servo/smoothing.py", "hal/servo/joint.py", "hal/servo/servo.py")
 
 N = 7
 PANDA = LimitsSpec(
@@ -236,7 +236,7 @@ class Stream:
         return optimum, [min(joint) for joint in joints], [max(joint) for joint in joints]
 
 
-def run(seed: int) -> Result:
+def run_stream(seed: int) -> Result:
     """Run one stream from its start to the end of its held target."""
     stream = Stream(seed)
     stream.wander(stream.random.uniform(0.5, 2.0))
@@ -249,36 +249,24 @@ def run(seed: int) -> Result:
     return Result(peaks, stream.travel, ratio, overshoot, stream.trips, stream.ticks, stream.description)
 
 
-def quantile(values: list[float], share: float) -> float:
-    """Return the value below which a share of the values is."""
-    return sorted(values)[min(len(values) - 1, int(share * len(values)))]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("count", type=int, nargs="?", default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    begun = time.perf_counter()
-    results = [run(arguments.seed + k) for k in range(arguments.count)]
-    seconds = time.perf_counter() - begun
-    ticks = sum(r.ticks for r in results)
-    print(f"{len(results)} streams, {ticks} set-points, {sum(r.trips for r in results)} trips, {seconds:.0f} s")
-    print(f"\n{'limit':14s} {'peak / limit':>14s} {'streams over':>14s}")
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    results = [run_stream(seed) for seed in range(10 if quick else 10_000)]
+    trips, ticks = sum(each.trips for each in results), sum(each.ticks for each in results)
+    table = Table(
+        f"{len(results)} streams, {ticks} set-points, {trips} trips", ("", "peak, of the limit", "streams over")
+    )
     for name in ("position", "velocity", "acceleration", "jerk"):
-        values = [r.peaks[name] for r in results]
-        print(f"{name:14s} {max(values):14.9f} {sum(v > 1.0 for v in values):14d}")
-    print(f"\n{'held targets':30s} {'median':>10s} {'p99':>10s} {'worst':>10s} {'over':>8s}   allowed")
-    for name, values, allowed, unit in (
-        ("time / time-optimal", [r.ratio for r in results], 1.2, ""),
-        ("overshoot, mrad", [1e3 * r.overshoot for r in results], 1.0, " mrad"),
+        values = [each.peaks[name] for each in results]
+        table.add(name, f"{max(values):.9f}", sum(value > 1.0 for value in values))
+    yield table
+    table = Table("held targets", ("", "median", "p99", "worst", "its stream", "over", "allowed"))
+    for name, key, factor, allowed in (
+        ("time / time-optimal", "ratio", 1.0, 1.2),
+        ("overshoot, mrad", "overshoot", 1e3, 1.0),
     ):
-        over = sum(v > allowed for v in values)
-        figures = f"{statistics.median(values):10.4f} {quantile(values, 0.99):10.4f} {max(values):10.4f}"
-        print(f"{name:30s} {figures} {over:8d}   {allowed}{unit}")
-    for result in sorted(results, key=lambda r: -r.ratio)[:3]:
-        print(f"slowest: {result.ratio:.3f}, {result.description}")
-
-
-if __name__ == "__main__":
-    main()
+        found = sorted((factor * getattr(each, key), each.description) for each in results)
+        values = [value for value, _ in found]
+        p99, over = values[int(0.99 * len(values))], sum(value > allowed for value in values)
+        table.add(name, median(values), p99, *found[-1], over, allowed)
+    yield table

@@ -1,38 +1,35 @@
-"""Median time of one servo tick per kind of command, beside a bare Ruckig update in the same run.
+"""Time of one servo tick for each kind of command, beside a bare Ruckig update in the same run.
 
-    python benchmarks/servo_tick.py [ticks] [--idle]
-
-"Prepared" is the tick of a device that sets the pace (a Franka): the set-point was computed after the last write, which
-takes the time in the next column, and is handed out when the device took the last one. ``--idle`` waits for the rest of
-each millisecond, as a host does: the processor's cold caches are then included.
-
-Times differ from machine to machine and from minute to minute; the last column, the ratio to the reference measured in
-turn with it, is what to compare.
+"Answer" is that to a device that extrapolates (a Franka): the set-point was computed after the last write, and is
+handed out when the device took the one before. The second table waits for the rest of each millisecond between two
+ticks, as a host does: the processor's cold caches are then included. Times differ from machine to machine and from
+minute to minute; compare the ratio to the reference, which is measured in turn with them.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
 import math
-import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Synchronization
-from servo_streams import PANDA, robot_spec
 
 from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
 from hal.config.data_files import find_data
 from hal.driver import Reading
 from hal.dynamics import Dynamics
 from hal.kinematics.arm import Kinematics
-from hal.servo.audit import SetpointAudit
 from hal.servo.controllers import Controller, JointImpedance, OperationalSpace, Position, controller_data, resolve
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec, WorkspaceSpec
+
+from .kit import Table, median
+from .servo_streams import PANDA, robot_spec
+
+PATHS = ("hal/servo", "hal/kinematics", "hal/dynamics.py")
 
 RATE_HZ = 1000.0
 STILL = [0.0] * 7
@@ -72,17 +69,6 @@ class Bare:
         self.q, self.dq, self.ddq = output.new_position, output.new_velocity, output.new_acceleration
 
 
-@dataclass
-class Times:
-    """Medians of one kind of command, us."""
-
-    median: float
-    p99: float
-    answer: float
-    """Median of the answer to a device that extrapolates, which gets the set-point of the tick before."""
-    reference: float
-
-
 def measure(
     spec: RobotSpec,
     kind: Kind | None,
@@ -91,8 +77,8 @@ def measure(
     ticks: int,
     idle: bool,
     controller: Controller,
-) -> Times:
-    """Return the times of a tick and of an answer. Without a kind: move_to."""
+) -> tuple[float, ...]:
+    """Return the median and p99 of a tick, the median of an answer and of the reference, us. No kind: ``move_to``."""
     kinematics = Kinematics(spec.kinematics)
     mass_matrix = Dynamics.of(spec).mass_matrix
     servo = Servo(spec, 1 / RATE_HZ, kinematics, mass_matrix, extrapolates=True)
@@ -134,29 +120,15 @@ def measure(
             time.sleep(max(0.0, due - time.perf_counter()))
     if servo.report.trip or max(abs(a - b) for a, b in zip(q, start, strict=True)) < 1e-3:
         raise RuntimeError(f"{kind}: the arm did not move as it should: {servo.report}")
-    times.sort()
-    median, p99 = statistics.median(times) / 1e3, times[int(0.99 * ticks)] / 1e3
-    return Times(median, p99, statistics.median(answers or [0]) / 1e3, statistics.median(references) / 1e3)
+    p99 = sorted(times)[int(0.99 * ticks)]
+    return tuple(1e-3 * spent for spent in (median(times), p99, median(answers or [0]), median(references)))
 
 
-def audit_time(ticks: int) -> float:
-    """Return the median time of one sample of the audit, us."""
-    audit = SetpointAudit(PANDA, 1 / RATE_HZ)
-    times = []
-    for k in range(ticks):
-        q = [0.1 * math.sin(0.001 * k + i) for i in range(7)]
-        begun = time.perf_counter_ns()
-        audit.add(q)
-        times.append(time.perf_counter_ns() - begun)
-    return statistics.median(times) / 1e3
+Case = tuple[str, RobotSpec, Kind | None, Values, float, Controller]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ticks", type=int, nargs="?", default=5000)
-    parser.add_argument("--idle", action="store_true", help="wait for the rest of each millisecond between two ticks")
-    args = parser.parse_args()
-    ticks, idle = args.ticks, args.idle
+def cases() -> list[Case]:
+    """Return what is measured: name, arm, kind of command, its values, the limit of the tcp's speed, the controller."""
     free, capped = 1e9, 0.25
     box = WorkspaceSpec((0.1, -0.8, 0.0), (0.9, 0.8, 1.2))
 
@@ -187,7 +159,7 @@ def main() -> None:
     arm = Kinematics(spec.kinematics)
     task = resolve(OperationalSpace(), spec, arm, RATE_HZ)
     joints = resolve(JointImpedance(), spec, arm, RATE_HZ)
-    cases: list[tuple[str, RobotSpec, Kind | None, Values, float]] = [
+    plain: list[tuple[str, RobotSpec, Kind | None, Values, float]] = [
         ("joint targets, moving", spec, Kind.JOINT_TARGET, sine, free),
         ("joint targets, held", spec, Kind.JOINT_TARGET, held, free),
         ("joint targets, tcp speed capped", spec, Kind.JOINT_TARGET, sine, capped),
@@ -200,21 +172,24 @@ def main() -> None:
         ("torques, capped, workspace", walled, Kind.JOINT_TORQUE, torque, capped),
         ("move_to", spec, None, held, capped),
     ]
-    controlled = [
+    return [
+        *((*case, Position()) for case in plain),
         ("poses, OperationalSpace", walled, Kind.CARTESIAN_TARGET, target, capped, task),
         ("twists, OperationalSpace", spec, Kind.TWIST, twist, capped, task),
         ("twists, JointImpedance", spec, Kind.TWIST, twist, capped, joints),
     ]
+
+
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
+    columns = ("us", "median", "p99", "answer, median", "Ruckig's own step (reference)", "ratio")
     gc.disable()
-    heads = ("median", "p99", "answer", "reference", "ratio")
-    print(f"{'kind of command':34s}" + "".join(f"{head:>10s}" for head in heads) + "   (us)")
-    for name, case, kind, values, tcp_speed, controller in [*((*each, Position()) for each in cases), *controlled]:
-        how = (values, tcp_speed, ticks)
-        found = measure(case, kind, *how, idle, controller)
-        numbers = (found.median, found.p99, found.answer, found.reference, found.median / found.reference)
-        print(f"{name:34s}" + "".join(f"{x:10.1f}" for x in numbers))
-    print(f"{'audit, one sample':34s} {audit_time(ticks):8.1f}")
-
-
-if __name__ == "__main__":
-    main()
+    try:
+        for idle in (False,) if quick else (False, True):
+            table = Table("with a pause between two ticks" if idle else "tick after tick", columns)
+            for name, spec, kind, values, tcp_speed, controller in cases():
+                found = measure(spec, kind, values, tcp_speed, 1000 if quick else 5000, idle, controller)
+                table.add(name, *found, found[0] / found[3])
+            yield table
+    finally:
+        gc.enable()

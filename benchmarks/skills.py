@@ -1,7 +1,5 @@
 """The skills in simulation, in lock-step: how many tries succeed, judged by where the object really ends.
 
-    python benchmarks/skills.py [--tries 100] [--engine mujoco] [--only "grasp mug"]
-
 An object is put somewhere before the arm, at any angle, and found by ground truth, or by the depth of the camera on
 the hand, exact or with the noise of a D435. A grasp succeeds if the object is 10 cm up after it was held there for 2 s.
 A gentle grasp begins 1 to 15 mm off the middle of the cube, and may move it by 2 mm before it lifts it. A push succeeds
@@ -11,19 +9,15 @@ if the object's middle ends within 1 cm of a goal that is 5 to 15 cm away. Goals
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 import hal
-from hal import registry
-from hal.registry import EngineChoice
 from hal.skills import (
     LocatedObject,
     SkillProgress,
@@ -35,6 +29,9 @@ from hal.skills import (
     push_to,
 )
 
+from .kit import ENGINES, Table
+
+PATHS = ("hal/skills", "drivers/pybullet", "drivers/mujoco", "drivers/scene")
 OBJECTS: dict[str, Any] = {
     "cube": "cube",
     "cylinder": {
@@ -163,34 +160,22 @@ def pushes(engine: str, thing: str, tries: int, seed: int = 0) -> list[str]:
     return ends
 
 
-ROWS: dict[str, Callable[[str, int], list[str]]] = {
-    f"grasp {thing}, {how}": lambda engine, tries, thing=thing, how=how: grasps(engine, thing, how, tries)
-    for thing in OBJECTS
-    for how in (TRUTH, DEPTH, NOISY)
-}
-ROWS["gentle grasp cube"] = lambda engine, tries: gentle_grasps(engine, "cube", tries)
-ROWS |= {
-    f"push {thing}": lambda engine, tries, thing=thing: pushes(engine, thing, tries) for thing in ("cube", "cylinder")
-}
+def rows() -> Iterator[tuple[str, Callable[[str, int], list[str]]]]:
+    """Yield what is tried, and its function of the engine and the number of tries."""
+    for thing in OBJECTS:
+        for how in (TRUTH, DEPTH, NOISY):
+            yield f"grasp {thing}, {how}", lambda engine, tries, thing=thing, how=how: grasps(engine, thing, how, tries)
+    yield "gentle grasp cube", lambda engine, tries: gentle_grasps(engine, "cube", tries)
+    for thing in ("cube", "cylinder"):
+        yield f"push {thing}", lambda engine, tries, thing=thing: pushes(engine, thing, tries)
 
 
-def main() -> None:
-    """Run the program."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tries", type=int, default=100)
-    parser.add_argument("--engine", choices=get_args(EngineChoice), default="auto")
-    parser.add_argument("--only", default="", help="only rows whose name contains this")
-    args = parser.parse_args()
-    engine = registry.choose_engine(args.engine)
-    print(f"{engine}, {args.tries} tries each, in lock-step")
-    for name, run in ROWS.items():
-        if args.only not in name:
-            continue
-        start = time.perf_counter()
-        ends = Counter(run(engine, args.tries))
-        failed = ", ".join(f"{count} {reason}" for reason, count in ends.most_common() if reason)
-        print(f"{name:40} {ends['']:4d} of {args.tries}  {time.perf_counter() - start:6.1f} s  {failed}", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the table."""
+    tries = 1 if quick else 100
+    table = Table(f"of {tries} tries each, in lock-step", ("", *(f"{engine}; failed" for engine in ENGINES)))
+    for name, measure in list(rows())[-2 if quick else 0 :]:
+        ends = [Counter(measure(engine, tries)) for engine in ENGINES]
+        failed = (", ".join(f"{count} {reason}" for reason, count in each.most_common() if reason) for each in ends)
+        table.add(name, *(f"{each['']}; {text}".rstrip("; ") for each, text in zip(ends, failed, strict=True)))
+    yield table

@@ -1,29 +1,28 @@
-"""Time from the silence of a dead-man, a pad or a stream of commands until the arm brakes, in real time.
-
-    python benchmarks/stops.py [--runs 5]
-
-A recorded pad holds the dead-man and a direction; then it freezes, is unplugged or released, or the program stops
-sending. The times of the event and of the braking are those of the two processes' common clock. The reference in the
-same run is `rig.stop()`, which no limit delays.
-"""
+"""Times until the arm brakes and rests: after a silence of a dead-man or a pad, and after each end of an app."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
-import statistics
 import tempfile
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
+from observer import Watched
+
 import hal
+from hal.config.data_files import find_data
 from hal.errors import MotionStopped
 
+from .kit import Table, ms
+
+PATHS = ("hal/servo/watchdog.py", "hal/deadman.py", "hal/control.py", "hal/host")
 EVENT = 2.5
 """Time of the event, s after the pad's first poll."""
 WAYS = ("rig.stop() (reference)", "dead-man released", "pad frozen", "pad unplugged", "commands stop")
+ENDS = ("exception", "kill -9", "SIGTERM", "Ctrl-C", "closed terminal", "SIGSTOP", "Ctrl-Z")
 
 
 def recording(folder: Path, tour: Path, release: bool) -> Path:
@@ -52,8 +51,6 @@ def recording(folder: Path, tour: Path, release: bool) -> Path:
 
 def measure(way: str, folder: Path) -> tuple[float, float]:
     """Return seconds from the event to the start of braking, and to rest."""
-    from hal.config.data_files import find_data
-
     path = recording(folder, find_data("config", "teleop/tour.jsonl"), way == "dead-man released")
     options = {"pad frozen": {"freeze_at": EVENT}, "pad unplugged": {"disconnect_at": EVENT}}.get(way, {})
     pad_config = {"model": "auto", "driver": "playback", "file": str(path), "options": options}
@@ -92,21 +89,38 @@ def measure(way: str, folder: Path) -> tuple[float, float]:
     raise RuntimeError(f"{way}: the arm did not stop")
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description="time from silence to braking")
-    parser.add_argument("--runs", type=int, default=5, help="of each way (%(default)s)")
-    runs = parser.parse_args().runs
+def measure_end(how: str) -> tuple[float, float, float | None]:
+    """Return seconds to the start of braking, to rest, and until no process is left (None: they are meant to stay)."""
+    with tempfile.TemporaryDirectory() as folder:
+        app = Watched(Path(folder), ending="exception" if how == "exception" else "")
+        try:
+            full = app.speed()
+            if how == "exception":
+                began = when = app.wait_for(lambda: app.speed() < 0.999 * full)
+            else:
+                when = app.end(how)
+                began = app.wait_for(lambda: app.speed() < 0.999 * full)
+            rest = app.wait_for(app.at_rest)
+            gone = None if how in ("SIGSTOP", "Ctrl-Z") else app.wait_for(app.nobody_left)
+        finally:
+            app.close()
+    return began - when, rest - when, None if gone is None else gone - when
+
+
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the tables."""
     warnings.simplefilter("ignore", RuntimeWarning)  # that a session was stopped is what is measured
-    print(f"{'ms after the event: median (max)':34s}{'braking begins':>20s}{'at rest':>20s}")
-    for way in WAYS:
+    runs, columns = 1 if quick else 5, ("ms after the event, median (max)", "braking begins", "at rest")
+    table = Table(f"silence, {runs} times each", columns)
+    for way in WAYS[:2] if quick else WAYS:
         with tempfile.TemporaryDirectory() as folder:
             found = [measure(way, Path(folder)) for _ in range(runs)]
-        cells = [
-            f"{1e3 * statistics.median(column):.0f} ({1e3 * max(column):.0f})" for column in zip(*found, strict=True)
-        ]
-        print(f"{way:34s}" + "".join(f"{cell:>20s}" for cell in cells), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        table.add(way, *(ms(column) for column in zip(*found, strict=True)))
+    yield table
+    table = Table(f"ends of an app at 0.4 rad/s, {runs} times each", (*columns, "processes gone"))
+    for how in ENDS[:2] if quick else ENDS:
+        ends = [measure_end(how) for _ in range(runs)]
+        cells = [[value for value in column if value is not None] for column in zip(*ends, strict=True)]
+        name = "exception, from braking (reference)" if how == "exception" else how
+        table.add(name, *(ms(values) if values else "stay" for values in cells))
+    yield table

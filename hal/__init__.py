@@ -11,8 +11,15 @@ Importing this package is cheap: every name is loaded on first use.
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+if os.path.isfile(os.path.join(__path__[0], "drivers")):  # a link in a checkout, a folder in a wheel
+    raise ImportError(
+        f"{__path__[0]} has text files in place of links: git made this checkout without symbolic links. Run in it: "
+        "git config core.symlinks true && git restore hal src (on Windows in developer mode or as administrator)"
+    )
 
 if TYPE_CHECKING:
     from . import gym as gym

@@ -17,6 +17,8 @@ __all__ = ["Clock", "LockStepClock", "RealClock", "Tick", "describe_load"]
 _ROUNDING = 1e-9
 _LONGEST = 1e9
 """Greatest time of a sleep, s."""
+_BETWEEN = 0.004
+"""Least time between two ticks of a loop that an event wakes, s."""
 
 
 class Tick(NamedTuple):
@@ -25,7 +27,7 @@ class Tick(NamedTuple):
     t: float
     """Time on the clock, s."""
     dt: float
-    """Time since the last iteration, s: a whole number of periods."""
+    """Time since the last iteration, s: a whole number of periods, but for a loop that an event wakes."""
     missed: int
     """Iterations that were skipped because the loop's body took too long; they are never made up for."""
     elapsed: float = 0.0
@@ -47,25 +49,40 @@ class Clock(ABC):
         """Wait for a duration, s. In lock-step this advances the simulation."""
         self.sleep_until(self.now() + number("seconds", seconds))
 
-    def rate(self, hz: float) -> Iterator[Tick]:
+    def rate(self, hz: float, wake: threading.Event | None = None) -> Iterator[Tick]:
         """Yield a :class:`Tick` ``hz`` times a second, for ever; the first at once.
+
+        Args:
+            hz: Rate, Hz.
+            wake: In real time, also yield a tick as soon as this event is set, 4 ms after the last tick at the
+                earliest, and clear it (see :meth:`hal.Gamepad.wake`).
 
         Raises:
             CommandError: The rate is not positive, or not finite.
         """
-        return self._turns(1.0 / number("a rate", hz, "Hz", least=0.0, above=True, most=1e9))
+        return self._turns(1.0 / number("a rate", hz, "Hz", least=0.0, above=True, most=1e9), wake)
 
-    def _turns(self, period: float) -> Iterator[Tick]:
+    def _turns(self, period: float, wake: threading.Event | None) -> Iterator[Tick]:
         start = self.now()
         turn, missed = 0, 0
+        dt = period
         while True:
             now = self.now()
-            yield Tick(now, period * (1 + missed), missed, now - start)
+            yield Tick(now, dt, missed, now - start)
             turn += 1
             late = int((self.now() - start) / period + 1e-9) - turn
             missed = max(0, late)
             turn += missed
+            dt = period * (1 + missed)
+            while wake is not None and self._is_woken(wake, start + turn * period):
+                before, now = now, self.now()
+                yield Tick(now, now - before, 0, now - start)
+                dt = start + turn * period - now
             self.sleep_until(start + turn * period)
+
+    def _is_woken(self, wake: threading.Event, t: float) -> bool:
+        """Wait until the event is set, which clears it, or until the time ``t``; return whether it was set."""
+        return False
 
 
 class RealClock(Clock):
@@ -82,6 +99,12 @@ class RealClock(Clock):
             time.sleep(rest if rest < _LONGEST else number("t", t, "s on this clock", most=_LONGEST))
         elif rest != rest:
             number("t", t, "s on this clock")
+
+    def _is_woken(self, wake: threading.Event, t: float) -> bool:
+        self.sleep_until(min(t, self.now() + _BETWEEN))
+        woken = wake.wait(max(0.0, t - self.now())) and self.now() < t
+        wake.clear()
+        return woken
 
 
 class LockStepClock(Clock):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from .commands import DeadmanRecord
 from .errors import NotSupported
+from .servo.watchdog import PAD_SILENCE, is_alive
 
 __all__ = ["Deadman", "Threshold"]
 
@@ -78,6 +79,13 @@ class Deadman:
     def held(self) -> bool:
         """Whether the switch is held, and counts."""
         return self._record.held
+
+    def holds(self, now: float) -> bool:
+        """Return whether the switch is held, and gave a sign of life lately, at ``now`` (s on the host's clock).
+
+        For motions that no session watches. A session has its own, stricter watch in the servo.
+        """
+        return self._record.held and is_alive(now, self._record.t_alive, PAD_SILENCE)
 
     @property
     def connected(self) -> bool:

@@ -84,6 +84,10 @@ class DeviceDriver(ABC):
         """Switch simulated faults on or off, for tests; a driver without faults raises NotSupported."""
         raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
 
+    def statistics(self) -> dict[str, Any]:
+        """Return figures about the device and its connection, as plain numbers and texts, for reports."""
+        return {}
+
     @abstractmethod
     def close(self) -> None:
         """Stop safely and release the device, within 8 s. Idempotent; a lost link is no error.
@@ -273,10 +277,6 @@ class RobotDriver(DeviceDriver):
             Homogeneous matrix (16,) in column-major order, base frame, m; None if the device reports none.
         """
         return None
-
-    def statistics(self) -> dict[str, Any]:
-        """Return figures about the connection, as plain numbers and texts, for reports."""
-        return {}
 
     def reset_statistics(self) -> None:
         """Start the figures of :meth:`statistics` again from zero."""

@@ -78,7 +78,7 @@ class Gamepad:
         self._state = PadState(Stamp(_UNPLUGGED.t, _UNPLUGGED.t_device, _UNPLUGGED.seq))
         self._held: dict[str, HeldControl] = {}
         self._lock = threading.RLock()
-        self._changed = threading.Condition()
+        self._wakers: list[threading.Event] = []
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._open = False
@@ -89,12 +89,9 @@ class Gamepad:
         """Return the newest state; never waits. An unplugged pad has ``connected=False`` and everything released."""
         return self._state
 
-    def wait(self, timeout: float) -> PadState:
-        """Return the state after its next change, or the present one after ``timeout`` s. Needs a thread."""
-        seen = self._state
-        with self._changed:
-            self._changed.wait_for(lambda: self._state is not seen or self._stopping.is_set(), timeout)
-        return self._state
+    def wake(self, event: threading.Event) -> None:
+        """Set an event whenever an axis, a button or the connection changes, for ``rig.clock.rate(hz, wake=event)``."""
+        self._wakers.append(event)
 
     def hold(self, control: str = "l2") -> Deadman:
         """Return the dead-man switch on a button or trigger; the same object for every call.
@@ -250,11 +247,13 @@ class Gamepad:
             state = PadState(
                 Stamp(reading.t, reading.t_device, reading.seq), MappingProxyType(axes), buttons, reading.connected
             )
-            if (last.stamp, last.axes, last.buttons, last.connected) == (state.stamp, axes, buttons, state.connected):
+            same = (last.axes, last.buttons, last.connected) == (axes, buttons, state.connected)
+            if same and last.stamp == state.stamp:
                 return
             self._state = state
-        with self._changed:
-            self._changed.notify_all()
+        if not same:
+            for event in self._wakers:
+                event.set()
 
     def _shaped(self, name: str, value: float) -> float:
         if name.startswith("dpad"):
@@ -264,8 +263,6 @@ class Gamepad:
     def close(self) -> None:
         """Stop polling and release the device; every dead-man is released. Idempotent."""
         self._stopping.set()
-        with self._changed:
-            self._changed.notify_all()
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
             thread.join(_JOIN)

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from types import MappingProxyType
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from .errors import DeviceNotFound, DriverMissing, NotSupported
 
@@ -30,7 +30,6 @@ __all__ = [
     "GROUP",
     "SIMULATION",
     "DriverSpec",
-    "EngineChoice",
     "PadInput",
     "check_engine",
     "checked",
@@ -71,11 +70,9 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
 )
 """Name of a built-in driver -> place of its :class:`DriverSpec`, as "module:ATTRIBUTE"."""
 
-EngineChoice = Literal["auto", "pybullet", "mujoco"]
-"""Choice of the engine that simulates a rig; ``auto`` is the first of :data:`ENGINES` that is installed."""
-
-ENGINES: tuple[str, ...] = get_args(EngineChoice)[1:]
-"""Drivers that simulate arms, grippers and cameras in a world; a rig uses one of them."""
+ENGINES = ("pybullet", "mujoco")
+"""Built-in engines of the simulation, the first of which that is installed is the engine ``auto``. Any other driver
+with a :attr:`~DriverSpec.world` is an engine, too."""
 
 SIMULATION = "simulation"
 """Stands in ``drivers: {sim: simulation}`` for the engine of the rig."""
@@ -95,7 +92,8 @@ class DriverSpec:
     gamepad: str | None = None
     """A :class:`~hal.driver.GamepadDriver`."""
     world: str | None = None
-    """The simulated world of this driver's arms, grippers and cameras."""
+    """A :class:`~hal.world.WorldDriver`, which makes this driver an engine of the simulation: the world of its arms,
+    grippers and cameras."""
     viewer: str | None = None
     """A window with the simulated world: :class:`~hal.views.Viewer`."""
     viewer3d: str | None = None
@@ -216,11 +214,24 @@ def pad_driver(pad_input: PadInput) -> str:
 
 def is_engine(name: str | None) -> bool:
     """Return whether a name under ``drivers`` stands for the rig's engine: ``simulation``, or the name of an engine."""
-    return name == SIMULATION or name in ENGINES
+    if name is None or name in BUILT_IN:
+        return name in ENGINES
+    try:
+        return name == SIMULATION or driver(name).world is not None
+    except (DeviceNotFound, DriverMissing):
+        return False
+
+
+def explain_engine(choice: str) -> str | None:
+    """Return why ``choice`` is neither ``auto`` nor the name of an engine; None if it is."""
+    if choice == "auto" or (choice != SIMULATION and is_engine(choice)):
+        return None
+    there = ("auto", *ENGINES)
+    return f"{choice!r} is no engine{_nearest(choice, there)}: {', '.join(there)}, or a driver with a world"
 
 
 def choose_engine(choice: str) -> str:
-    """Return the name of the engine for an :data:`EngineChoice`; for ``auto`` the first one if none is installed.
+    """Return the name of the engine for the choice of a rig; for ``auto`` the first one if none is installed.
 
     Imports no engine, and does not check that a named one is installed (see :func:`check_engine`).
     """

@@ -175,7 +175,7 @@ class Robot:
         Raises:
             StaleStateError: The newest state is older than ``max_age``, or there is none yet (``code`` is
                 ``no_state``).
-            ConnectionLost: The arm, or the process that owns it, does not answer.
+            ConnectionLost: The arm, or the process that owns it, does not answer; ``code`` is that of the arm's fault.
         """
         self._host.check()
         state = self._mail.get_state()
@@ -183,8 +183,9 @@ class Robot:
             raise StaleStateError(f"{self.name} has not reported a state yet", code="no_state")
         age = self.clock.now() - state.stamp.t
         if state.status is RobotStatus.LOST:
-            reason = f": {state.fault.cause}; {state.fault.remedy}" if state.fault is not None else ""
-            raise ConnectionLost(f"{self.name} does not answer{reason} (its last state is {age:.3f} s old)")
+            fault = state.fault
+            reason, code = ("", None) if fault is None else (f": {fault.cause}; {fault.remedy}", fault.code)
+            raise ConnectionLost(f"{self.name} does not answer{reason} (its last state is {age:.3f} s old)", code=code)
         if not age <= max_age:
             number("max_age", max_age, "s")
             text = f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["SessionEvent", "SessionEventKind", "TeleopSession"]
 
 RATE_HZ = 50.0
-"""Rate at which the pad is read and commands are sent, Hz."""
+"""Rate at which commands are sent, Hz, beside those for changes of the pad."""
 RETRY_DELAY = 0.1
 """Pause after a stop, before the next control session is opened, s."""
 REOPEN_PERIOD = 1.0
@@ -157,6 +158,10 @@ class TeleopSession:
         self._actions = actions
         self._on_event = on_event
         self._on_tick = on_tick
+        self._moved = threading.Event()
+        """Set by a pad that has changed."""
+        for arm in self.arms:
+            arm.pad.wake(self._moved)
         self._changes: dict[str, str | float] = {}
         """Settings that the page in control changed and that are not applied yet, the newest value of each."""
         self._reopen_at = 0.0
@@ -362,7 +367,7 @@ class TeleopSession:
         with ExitStack() as sessions:
             controls = self._open_controls(sessions)
             sessions.callback(_brake, controls.values())  # all at once, before the first is waited for
-            for tick in self.rig.clock.rate(RATE_HZ):
+            for tick in self.rig.clock.rate(RATE_HZ, self._moved):
                 for arm in self.arms:
                     if arm in controls and not self._drive(arm, controls[arm], tick.dt):
                         del controls[arm]

@@ -221,7 +221,7 @@ class Teleop:
         if pad.can_hold:
             lines = [f"hold {deadman} to move; release it to stop"]
         else:
-            lines = [f"each key is one small step, with {deadman} included"]
+            lines = ["each key press is one small step"]
         moves: dict[str, list[str]] = {"m/s": [], "rad/s": []}
         for axis, low, high, unit in self._directions():
             # Two buttons and sideways axes ("left/right") are named with the low end first, others ("up/down") last.

@@ -6,6 +6,9 @@ contact: its target never is farther ahead of the fingers than the force divided
 of the speed, since the damping would press with that. So with a small force the fingers are soft in motion, and slower
 than commanded where friction takes much of it. How hard their inertia hits an object depends on the speed alone.
 
+``home`` finds the closed position: the fingers close slowly, with little force, until something stops them. From then
+on the table begins there, wherever the motor's zero is; the ``offset`` in the rig makes it last.
+
 The motor is switched on by the first command. When the program ends, it holds for its TIMEOUT (0.4 s), and then damps:
 a held object that pushes the fingers open comes loose.
 """
@@ -47,6 +50,12 @@ _FRESH = 0.02
 """Greatest age of the state at which the motor is switched on, s: it may have been turned by hand since."""
 _ATTEMPTS = 3
 """How often the motor is switched on until it counts as broken."""
+_HOMING_SPEED, _HOMING_FORCE = 0.02, 10.0
+"""Greatest speed of the width, m/s, and greatest force, N, with which the closed position is looked for."""
+_HOMING_PRESSED, _HOMING_SHARE = 0.3, 0.8
+"""Time, s, for which the fingers press with that share of the force, at rest, where they are closed."""
+_HOMING_WAY = 1.1
+"""Greatest way on which they must meet something, as a multiple of the table's."""
 
 
 class FingerTable:
@@ -65,6 +74,16 @@ class FingerTable:
         ]
         self.opening = 1.0 if self._slopes[0] > 0.0 else -1.0
         """Direction of the angle that opens the fingers."""
+
+    @property
+    def closed(self) -> float:
+        """Angle of the narrowest width, rad."""
+        return self._angles[0 if self.opening > 0.0 else -1]
+
+    @property
+    def range(self) -> float:
+        """Angle from one end to the other, rad."""
+        return self._angles[-1] - self._angles[0]
 
     def _part(self, angle: float) -> int:
         return min(max(bisect_right(self._angles, angle) - 1, 0), len(self._slopes) - 1)
@@ -122,6 +141,12 @@ class DamiaoGripper(GripperDriver):
         """The narrowest width since then, or else the widest, m."""
         self._held = False
         """Whether they held an object at the last reading."""
+        self._homing = False
+        """Whether the closed position is being looked for."""
+        self._pressed = self._pressed_at = 0.0
+        """Time for which the fingers have pressed, s, and the angle there, rad; a stop in between does not end it."""
+        self._offset: float | None = None
+        """The motor's offset for which the closed position that was found is the table's, rad."""
         self._now: float | None = None
         self._seq = 0
         self._t = -1.0
@@ -166,7 +191,7 @@ class DamiaoGripper(GripperDriver):
             cause = f"{motor.label} went off: what it held may be loose"
             fault = Fault("switched_off", cause, "check its power supply, and send the command again")
         if fault is not None:
-            self._fault, self._active, self._goal = fault, False, self._ramp
+            self._fault, self._active, self._homing, self._goal = fault, False, False, self._ramp
 
     def _drive(self, now: float, dt: float) -> None:
         """Send the motor's command of this cycle, or a request for its state."""
@@ -218,6 +243,34 @@ class DamiaoGripper(GripperDriver):
             self._closed, self._turn = not self._closed, width
         else:
             self._turn = min(self._turn, width) if self._closed else max(self._turn, width)
+        if self._homing:
+            self._note_contact(dt)
+
+    def _note_contact(self, dt: float) -> None:
+        """Find the closed position: something stops the fingers, or the end of the table does not."""
+        motor, table = self._motor, self.table
+        if abs(motor.q - self._pressed_at) * table.slope(motor.q) > _PLAY:
+            self._pressed, self._pressed_at = 0.0, motor.q
+        elif self._grip_force() >= _HOMING_SHARE * self._force:
+            self._pressed += dt
+        if self._pressed >= _HOMING_PRESSED:
+            settings = self.settings
+            shift = motor.q - FingerTable(settings.widths).closed
+            self.table = FingerTable(tuple((angle + shift, width) for angle, width in settings.widths))
+            self._offset = settings.motor.offset - shift
+            self._homing, self._pressed = False, 0.0
+            self._goal = self._ramp = motor.q  # press no longer
+            self._target = self.table.width(motor.q)
+        elif self._ramp == self._goal:
+            self._homing = False
+            cause = f"{motor.label}: the fingers closed by {_HOMING_WAY:g} times their way, and nothing stopped them"
+            remedy = "check that the motor moves the fingers, and the `widths` in the rig"
+            self._fault = Fault("not_closed", cause, remedy)
+
+    def _grip_force(self) -> float:
+        """Return the force with which the motor closes the fingers, less the friction in the rig, N."""
+        motor, table = self._motor, self.table
+        return max(0.0, -table.opening * motor.tau - motor.settings.friction) / table.slope(motor.q)
 
     def _switch_on(self) -> None:
         """Switch the motor on where it is."""
@@ -246,9 +299,7 @@ class DamiaoGripper(GripperDriver):
         width = table.width(motor.q)
         if self._target is None:
             self._target = width
-        force = 0.0
-        if motor.on:
-            force = max(0.0, -table.opening * motor.tau - motor.settings.friction) / table.slope(motor.q)
+        force = self._grip_force() if motor.on else 0.0
         resting = self._resting >= _REST
         grasped = self._grasps(width, force) if resting else False
         self._held = grasped is True
@@ -258,7 +309,7 @@ class DamiaoGripper(GripperDriver):
             seq=self._seq,
             width=width,
             width_target=self._target,
-            moving=self._active and not resting,
+            moving=self._active and (self._homing or not resting),
             grasped=grasped if motor.on else None,
             force=force,
             outcome=None if self._fault is None else GripperOutcome.FAILED,
@@ -279,6 +330,17 @@ class DamiaoGripper(GripperDriver):
     # Commands.
 
     def move(self, width: float, speed: float, force: float) -> None:
+        self._homing = False
+        self._start(self.table.angle(width), min(speed, self.spec.speed), force)
+        self._target = width
+
+    def home(self) -> None:
+        table, speed, force = self.table, min(_HOMING_SPEED, self.spec.speed), min(_HOMING_FORCE, self.spec.force)
+        self._start(self._motor.q - table.opening * _HOMING_WAY * table.range, speed, force)
+        self._homing = True
+
+    def _start(self, goal: float, speed: float, force: float) -> None:
+        """Start a motion to an angle, rad, at a speed of the width, m/s."""
         chain, motor = self.chain, self._motor
         chain.usable  # noqa: B018  # raises if it is not open, or lost
         fault = chain.fault(engaged=False)
@@ -288,10 +350,7 @@ class DamiaoGripper(GripperDriver):
         self._attempts = 0
         if self._resting >= _REST and not self._held:
             self._closed, self._turn = False, self.table.width(motor.q)
-        self._target = width
-        self._goal = self.table.angle(width)
-        self._speed = min(speed, self.spec.speed)
-        self._force = force
+        self._goal, self._speed, self._force = goal, speed, force
         self._resting = 0.0
         if not motor.on:
             self._ramp = motor.q
@@ -300,11 +359,12 @@ class DamiaoGripper(GripperDriver):
     def stop(self) -> None:
         """Keep the fingers where they are; those that press on an object keep their force."""
         self.chain.usable  # noqa: B018  # raises if it is not open, or lost
+        self._homing = False
         motor = self._motor
         at = motor.q + (motor.dq * (self._now - motor.t) if self._now is not None and motor.t >= 0.0 else 0.0)
         ahead = self._greatest_torque() / motor.kp
         self._goal = min(max(self._ramp, at - ahead), at + ahead)
 
     def statistics(self) -> dict[str, Any]:
-        """Return figures about the connection, as those of the arm."""
-        return self.chain.statistics()
+        """Return figures about the connection, as those of the arm, and the ``offset`` that :meth:`home` found, rad."""
+        return {**self.chain.statistics(), "offset": self._offset}

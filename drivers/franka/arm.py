@@ -26,6 +26,7 @@ from hal.preflight import has_realtime_kernel
 from hal.specs import RobotSpec
 
 from . import DRIVER
+from .call_limit import LONGEST_CALL, CallLimit
 from .faults import ARM_PORT, fault_of, fault_of_exception, is_connection_lost
 from .flags import FLAGS
 from .link import ArmLink, ArmMode, ArmSample, StreamKind
@@ -103,7 +104,8 @@ class FrankaArm(RobotDriver):
             self._fault, self._transient = None, False
         before = self._sample
         try:
-            self._sample = connection.link.read()
+            with connection.limit:
+                self._sample = connection.link.read()
         except connection.library_errors as error:
             self._handle_failure(error)
         self._t_received = time.perf_counter()
@@ -172,11 +174,13 @@ class FrankaArm(RobotDriver):
         """Start a motion of this kind, or end the one that is running."""
         held = link.motion is not StreamKind.TORQUE
         if link.motion is not None:
-            link.finish()
+            with self._connection.limit:
+                link.finish()
         if link.motion is None:  # a library with its own loop ends a motion when the cycle returns to it
             self._connection.configure(s)
             link.still = setpoint.q if held else None  # torques may have moved the arm on since it was measured
-            link.start(kind)
+            with self._connection.limit:
+                link.start(kind)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
         """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad.
@@ -192,7 +196,8 @@ class FrankaArm(RobotDriver):
         if link is None or link.motion is None:
             return
         try:
-            link.finish()
+            with self._connection.limit:
+                link.finish()
         except self._connection.library_errors as error:
             self._handle_failure(error)
 
@@ -207,17 +212,21 @@ class FrankaArm(RobotDriver):
         link = self._connection.link
         assert link is not None
         failed: list[BaseException] = []
+        limit = self._connection.limit
 
         def guarded_turn() -> None:
+            limit.stop()
             try:
                 turn()
             except BaseException as error:
                 failed.append(error)  # an error of the cycle must not count as a fault of the robot
                 raise
             self.answer_times.add(time.perf_counter() - self._t_received)  # the answer leaves when the turn is over
+            limit.start()
 
         try:
-            link.run(guarded_turn)
+            with limit:
+                link.run(guarded_turn)
         except BaseException as error:
             if failed or not isinstance(error, self._connection.library_errors):
                 raise
@@ -230,7 +239,11 @@ class FrankaArm(RobotDriver):
         connection = self._connection
         link = connection.link
         assert link is not None
-        link.abandon()
+        if connection.limit.expired():
+            connection.lose(_UNANSWERED)
+            return
+        with connection.limit:
+            link.abandon()
         if is_connection_lost(error):
             connection.lose(connection.explain(error))
             return
@@ -356,6 +369,11 @@ _PORT_MESSAGES = {
     PortState.NO_ROUTE: "Connection error",
 }
 """Messages of the libraries for the same conditions."""
+_UNANSWERED = Fault(
+    "unanswered",
+    f"the robot ended a motion, or was to, and did not answer for {LONGEST_CALL:g} s: the connection was closed",
+    "the driver connects again; look at Desk if the robot does not answer then",
+)
 _START_EMULATOR = "start it in another terminal: python -m hal.drivers.franka.emulator --host {} (--help for more)"
 
 
@@ -366,6 +384,7 @@ class ArmConnection:
         link: The vendor's library, connected; None while the connection is lost.
         lost: Reason for the loss, or None.
         library_errors: Exception classes that the library raises.
+        limit: Limits the library's calls that wait for an answer.
         reconnects: How often a lost robot was found again.
     """
 
@@ -375,6 +394,7 @@ class ArmConnection:
         self.link: ArmLink | None = None
         self.lost: Fault | None = None
         self.library_errors: tuple[type[Exception], ...] = (RuntimeError,)
+        self.limit = CallLimit()
         self.reconnects = 0
         self._lock: DeviceLock | None = None
         self._configured = False
@@ -416,6 +436,7 @@ class ArmConnection:
         self.link = link
         self.library_errors = link.library_errors
         link.connect(self.settings.host)
+        self.limit = CallLimit(resolve_host(self.settings.host), ARM_PORT)
         self._configured = False
         sample = link.read()
         self.configure(sample)
@@ -432,6 +453,7 @@ class ArmConnection:
         """Discard the link: the robot does not answer."""
         self.lost = reason
         self._retry_at = time.monotonic() + _RETRY_PERIOD
+        self.limit.close()
         link, self.link = self.link, None
         if link is not None:
             with contextlib.suppress(*self.library_errors):  # the library may fail to sign off
@@ -467,6 +489,7 @@ class ArmConnection:
 
     def close(self) -> None:
         """Disconnect, and release the arm for other programs. Idempotent."""
+        self.limit.close()
         link, self.link = self.link, None
         try:
             if link is not None:

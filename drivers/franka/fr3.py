@@ -74,10 +74,8 @@ class Fr3Link(ArmLink):
     def finish(self) -> None:
         command = self._command(self._still())
         command.motion_finished = True
-        try:
-            self._control.writeOnce(command)  # returns when the robot has ended the motion
-        finally:
-            self.abandon()
+        self._control.writeOnce(command)  # returns when the robot has ended the motion
+        self.abandon()
 
     def abandon(self) -> None:
         self._control = None  # the library cancels a motion when its handle is deleted

@@ -64,7 +64,7 @@ SOLUTION: dict[str, dict[str, Any]] = {
 
 "fine" is needed while fingers move slowly or hold something: with 100 iterations the six joints of a Robotiq 2F-85
 press with 52 N of 60. With "coarse" a step takes less time, and an arm follows less exactly; with PyBullet's own 50
-iterations fast arms exceed their speed limits a little. ``benchmarks/world_tick.py`` prints both."""
+iterations fast arms exceed their speed limits a little."""
 
 
 LEAST_HZ = 100.0

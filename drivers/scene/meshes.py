@@ -1,8 +1,8 @@
 """Mesh files as triangles, with fewer triangles where a file has far more than a picture can show.
 
-Parsing meshes takes much longer than reading them back (``benchmarks/render.py``): parsed meshes are kept in the user's
-cache folder. A cache that is missing, broken or not writable only costs that time. Without a graphics card, drawing
-costs time per triangle, and the meshes of an arm have far more triangles than a picture can show.
+Parsing meshes takes much longer than reading them back (``python -m benchmarks render``): parsed meshes are kept in
+the user's cache folder. A cache that is missing, broken or not writable only costs that time. Without a graphics card,
+drawing costs time per triangle, and the meshes of an arm have far more triangles than a picture can show.
 """
 
 from __future__ import annotations

@@ -1,58 +1,32 @@
-"""From keys to the controls of a gamepad: one bounded step for each press, or keys that are held.
-
-:class:`StepControls` is for terminals that do not report when a key is released, :class:`HeldControls` for those that
-do. Both have the same methods. Which key is which control is the table ``sensors/keyboard.yaml``.
-"""
+"""From keys (``sensors/keyboard.yaml``) to the controls of a gamepad: one bounded step for each press."""
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from hal.pads.keyboard import keyboard_table
 from hal.types import AXES
 
-from .keys import ALT, CTRL, PRESS, RELEASE, Key, LinkCheck
-
-__all__ = [
-    "HOLD_HELP",
-    "RELEASED",
-    "STEP_HELP",
-    "STOP_KEYS",
-    "HeldControls",
-    "PadControls",
-    "StepControls",
-    "TerminalOptions",
-]
+__all__ = ["HELP", "RELEASED", "STOP_KEYS", "PadControls", "StepControls", "TerminalOptions"]
 
 _TABLE = keyboard_table("terminal")
 STOP_KEYS = _TABLE.stop
-"""Keys that stop every arm, in both modes. A terminal reports Esc alone with a short delay."""
+"""Keys that stop every arm. A terminal reports Esc alone with a short delay."""
 _SHOULDERS = ("l1", "r1")
 """Buttons that usually move something, so a step presses the dead-man with them. Other buttons are left to the app."""
 
 _STOP = " or ".join(key.capitalize() for key in STOP_KEYS)
-_SLOW = " or ".join(key.capitalize() for key in _TABLE.slow)
-_HOLD = _TABLE.names["l2"]
-_KEYS = textwrap.indent(
-    textwrap.fill("; ".join(f"{keys}: {name}" for name, keys in _TABLE.names.items() if name != "l2"), 108), "    "
-)
-STEP_HELP = (
+_KEYS = textwrap.indent(textwrap.fill("; ".join(f"{keys}: {name}" for name, keys in _TABLE.names.items()), 108), "    ")
+HELP = (
     "keys of this terminal, one small step for each press (l2 is pressed with it); Ctrl-C ends\n"
     f"    {_STOP}: STOP; the next key continues. While the arm steps, other keys are ignored\n"
     f"{_KEYS}\n"
     "    buttons are pressed without l2, so functions that need l2 held, such as homing, are not available"
-)
-HOLD_HELP = (
-    "keys of this terminal, held down; Ctrl-C ends\n"
-    f"    hold {_HOLD} (l2) and other keys to move; release it to stop\n"
-    f"    {_STOP}: STOP; hold {_HOLD} again to continue\n{_KEYS}\n"
-    f"    {_SLOW}: slower. When the window loses the focus, or the link is slow, all keys count as released"
 )
 
 
@@ -67,8 +41,6 @@ class TerminalOptions(BaseModel):
 
     tty: str | None = None
     """The terminal, for example ``/dev/pts/3``; None for the program's own."""
-    mode: Literal["auto", "step"] = "auto"
-    """``auto``: keys are held where the terminal reports releases; ``step``: one step for each press everywhere."""
     step_s: float = Field(0.08, gt=0.0, le=0.08)
     """Duration of a step of an axis, s. The servo's watchdog ends a step after 0.12 s in any case; the difference is a
     margin for a loaded machine, which polls late."""
@@ -96,8 +68,6 @@ def _raw_axis(axis: str, share: float, dead_zone: float) -> float:
         return share
     return share * (1.0 - dead_zone) + (dead_zone if share > 0.0 else -dead_zone)
 
-
-# One step for each press.
 
 _SETTLE = 0.06
 """Time between two steps in which l2 is reported as released, s: the arm must rest before the next press counts."""
@@ -138,10 +108,10 @@ class StepControls:
         self._ready = 0.0
         self._grip = 0.0
 
-    def handle_key(self, key: Key, now: float) -> None:
+    def handle_key(self, key: str, now: float) -> None:
         """Begin a step for a key that was pressed at ``now`` (s), unless one is under way."""
-        if self._pulse is None and now >= self._ready and key.event != RELEASE and not key.modifiers & (ALT | CTRL):
-            self._pulse = self._pulse_of(key.name, now)
+        if self._pulse is None and now >= self._ready:
+            self._pulse = self._pulse_of(key, now)
 
     def _pulse_of(self, name: str, now: float) -> _Pulse | None:
         options, deadman = self._options, frozenset({"l2"})
@@ -195,67 +165,3 @@ class StepControls:
             return 1.0
         middle = (pulse.start + pulse.end) / 2
         return max(0.0, (middle if pulse.grip is not None and now < middle else pulse.end) - now)
-
-
-# Keys that are held.
-
-
-class HeldControls:
-    """Controls that follow the keys that are held; Space is l2.
-
-    A key counts from its press to its release. A repeat is not a press: a key that went down while the terminal was
-    away, or before a stop, counts only after it is pressed again.
-    """
-
-    def __init__(self, dead_zone: float) -> None:
-        self.link = LinkCheck()
-        self._zone = dead_zone
-        self._held: set[str] = set()
-        self._grip = 0.0
-        self._t_grip = -math.inf
-
-    def handle_key(self, key: Key, now: float) -> None:
-        """Note that a key was pressed or released at ``now``, s."""
-        if key.event == RELEASE:
-            self._held.discard(key.name)
-        elif key.event == PRESS and not key.modifiers & (ALT | CTRL):
-            self._held.add(key.name)
-
-    def stop(self, now: float) -> None:
-        """Count every key as released."""
-        self._held.clear()
-
-    def release(self) -> None:
-        """Count every key as released because the terminal is away. r2 starts from 0 when it is back."""
-        self._held.clear()
-        self._grip = 0.0
-
-    def controls(self, now: float) -> PadControls:
-        """Return the controls at ``now``, s."""
-        held = self._held
-        dt = min(0.1, max(0.0, now - self._t_grip))
-        self._t_grip = now
-        direction = sum(way for key, way in _TABLE.grip.items() if key in held)
-        self._grip = min(1.0, max(0.0, self._grip + _TABLE.grip_speed * dt * direction))
-        reach = _TABLE.slow_share if held.intersection(_TABLE.slow) else 1.0
-        shares = dict.fromkeys(AXES, 0.0)
-        for key, (axis, way) in _TABLE.sticks.items():
-            if key in held:
-                shares[axis] += reach * way
-        axes = {axis: _raw_axis(axis, share, self._zone) for axis, share in shares.items()}
-        buttons = {button for key, button in _TABLE.buttons.items() if key in held}
-        if held.intersection(_TABLE.hold):
-            axes["l2"] = 1.0
-            buttons.add("l2")
-        axes["r2"] = _raw_axis("r2", self._grip, self._zone)
-        if self._grip > 0.5:
-            buttons.add("r2")
-        return PadControls(axes, frozenset(buttons))
-
-    def t_alive(self, now: float) -> float:
-        """Return the time of the last proof of life, s."""
-        return self.link.t_alive
-
-    def time_to_next(self, now: float) -> float:
-        """Return the time until the next question to the terminal is due, s."""
-        return self.link.time_to_next(now)

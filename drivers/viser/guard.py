@@ -1,14 +1,13 @@
 """viser's server, restricted to the user of this machine. viser itself accepts every connection to its port.
 
 The port is bound to loopback, which excludes other machines, but neither other users of this one nor other pages in the
-user's browser. So a page must be opened by the link with the secret, which is exchanged for a cookie, and only a page
-of this server may open the connection that carries poses and drags.
+user's browser. What is accepted is decided as for the console (:mod:`hal.auth`). Only the way of the token differs,
+since viser's page cannot send it with its WebSocket: it is in the link, which is exchanged for a cookie.
 """
 
 from __future__ import annotations
 
 import hashlib
-import hmac
 import http.client
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -22,13 +21,12 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from hal.auth import Authenticator
 from hal.errors import HalError
 
 __all__ = ["HOST", "GuardedServer", "start_server"]
 
 HOST = "127.0.0.1"
-_HOSTS = ("127.0.0.1", "localhost", "[::1]")
-"""Accepted host names of this machine: a forwarded port keeps them, a hostile name server does not."""
 _REFUSED = "This page opens only by the link that the program printed.\n"
 
 Handler = Callable[[ServerConnection, Request], Response | Awaitable[Response | None] | None]
@@ -84,19 +82,20 @@ def _status(port: int, path: str) -> int:
 
 def _guard(secret: str, handler: Handler) -> Handler:
     """Return ``handler`` for requests with the secret, and a refusal for others."""
+    auth = Authenticator(secret, HOST, ())
     # Cookies do not distinguish ports, so each server has its own name for its cookie.
     name = f"robot_hal_{hashlib.sha256(secret.encode()).hexdigest()[:8]}"
 
     def guarded(connection: ServerConnection, request: Request) -> Any:
         refused = connection.respond(http.HTTPStatus.FORBIDDEN, _REFUSED)
-        if _without_port(request.headers.get("Host", "")) not in _HOSTS:
+        host, known = request.headers.get("Host"), auth.is_token(_cookie(request, name))
+        if not auth.is_known_host(host):
             return refused
-        if request.headers.get("Upgrade", "").lower() == "websocket":
-            origin = request.headers.get("Origin")
-            same = origin is None or origin == f"http://{request.headers['Host']}"
-            return handler(connection, request) if same and _same(_cookie(request, name), secret) else refused
+        if "Upgrade" in request.headers:
+            own = auth.is_own_origin(request.headers.get("Origin"), host)
+            return handler(connection, request) if own and known else refused
         token = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-        if not _same(token, secret) and not _same(_cookie(request, name), secret):
+        if not known and not auth.is_token(token):
             return refused
         response = handler(connection, request)
         if isinstance(response, Response):
@@ -107,16 +106,7 @@ def _guard(secret: str, handler: Handler) -> Handler:
     return guarded
 
 
-def _without_port(host: str) -> str:
-    name, colon, port = host.rpartition(":")
-    return name if colon and port.isdigit() else host
-
-
 def _cookie(request: Request, name: str) -> str:
     with suppress(CookieError, KeyError):
         return SimpleCookie("; ".join(request.headers.get_all("Cookie")))[name].value
     return ""
-
-
-def _same(a: str, b: str) -> bool:
-    return hmac.compare_digest(a.encode(), b.encode())

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
+from hal.auth import host_names, is_loopback, page_link, ssh_tunnel
 from hal.camera import Camera
 from hal.driver import PadReading, RawFrame
 from hal.errors import ConnectionLost, HalError
@@ -28,7 +29,6 @@ from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
 from hal.types import Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
 
-from .auth import host_names, is_loopback, page_link, ssh_tunnel
 from .messages import ALARMS
 from .pad import PadQueue, WebPad, lost_reading, pad_reading
 

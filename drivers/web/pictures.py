@@ -18,11 +18,11 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
+from hal.auth import Authenticator
 from hal.driver import RawFrame
 from hal.host.ring import FrameRing
 from hal.specs import CameraSpec
 
-from .auth import Authenticator
 from .messages import MalformedMessage, PictureDrawn, WatchRequest, parse
 from .sockets import PageSocket, PageSockets
 from .telemetry import rounded

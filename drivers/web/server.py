@@ -20,6 +20,7 @@ from typing import Any
 
 from aiohttp import web
 
+from hal.auth import Authenticator
 from hal.errors import ConnectionLost, DriverMissing, NotSupported
 from hal.host.process import Channel, SharedMemory
 from hal.host.ring import frame_rings
@@ -28,7 +29,6 @@ from hal.specs import CameraSpec, from_json
 from hal.types import BUTTONS, STICK_AXES
 from hal.views import ACTIONS
 
-from .auth import Authenticator
 from .messages import MalformedMessage, StopRequest, encode, parse
 from .pictures import PictureCache, PictureSockets
 from .session import AppQueue, WebPage, WebSession

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 
 from aiohttp import WSMsgType, web
 
-from .auth import PROTOCOL, Authenticator
+from hal.auth import PROTOCOL, Authenticator
+
 from .messages import MAX_BYTES
 
 __all__ = ["CONNECTIONS", "ConnectionLimit", "PageSocket", "PageSockets", "RateLimit"]

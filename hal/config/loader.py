@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import PrivateAttr
 
@@ -23,7 +23,6 @@ from .rigfile import RigFile
 __all__ = ["RigConfig", "load"]
 
 CLOCKS = ("real_time", "lock_step")
-ENGINE_CHOICES: tuple[str, ...] = get_args(registry.EngineChoice)
 
 
 class RigConfig(RigFile):
@@ -54,8 +53,8 @@ def load(
             leaves each device its own; None changes nothing.
         driver: Replaces every driver (``"mock"``); then lock-step is the default clock.
         clock: ``"real_time"`` or ``"lock_step"``; None for the rig's.
-        engine: Engine of the simulated world: ``"auto"``, ``"pybullet"`` or ``"mujoco"``; None for the rig's. It need
-            not be installed.
+        engine: Engine of the simulated world: ``"auto"``, ``"pybullet"``, ``"mujoco"``, or a driver with a world; None
+            for the rig's. It need not be installed.
         overrides: ``"KEY=VALUE"`` with the value in YAML, or a mapping from dotted keys to values.
 
     Raises:
@@ -63,7 +62,7 @@ def load(
     """
     problems = Problems()
     _check_arguments(sim, clock, engine, problems)
-    engine = engine if engine in ENGINE_CHOICES else None  # after a problem the rest is checked, too
+    engine = None if problems.found else engine  # after a problem the rest is checked, too
     stand_in = _stand_in(driver, problems)
     data, source, base = _read(config, problems)
     if data is None:
@@ -80,8 +79,7 @@ def _check_arguments(sim: object, clock: str | None, engine: str | None, problem
         problems.add("<arguments>", "sim", f"must be true, false or None, not {sim!r}", "wrong_type")
     if clock is not None and clock not in CLOCKS:
         problems.add("<arguments>", "clock", f"{clock!r} is not possible{nearest(clock, CLOCKS)}", "invalid_choice")
-    if engine is not None and engine not in ENGINE_CHOICES:
-        message = f"{engine!r} is not possible{nearest(str(engine), ENGINE_CHOICES)}"
+    if engine is not None and (message := registry.explain_engine(str(engine))):
         problems.add("<arguments>", "engine", message, "invalid_choice")
 
 

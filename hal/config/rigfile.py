@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
-from ..registry import EngineChoice
+from ..registry import explain_engine
 from ..specs import ViewSpec
 from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, SensorStream, by_name
 from .schema import (
@@ -345,11 +345,18 @@ class PadConfig(Strict):
     """Options of the driver."""
 
 
+def _check_engine(name: str) -> str:
+    if message := explain_engine(name):
+        raise ValueProblem(message, "invalid_choice")
+    return name
+
+
 class SimulationConfig(Strict):
     """The simulated world."""
 
-    engine: EngineChoice = "auto"
-    """The physics engine; ``auto`` is PyBullet where it is installed, else MuJoCo."""
+    engine: Annotated[str, AfterValidator(_check_engine)] = "auto"
+    """The physics engine: ``pybullet``, ``mujoco`` or a driver with a world; ``auto`` is PyBullet where it is
+    installed, else MuJoCo."""
     physics_hz: Annotated[float, Quantity("Hz", 50.0, 10000.0)] = 240.0
     """Steps of the simulation, and of the servos in it, per second."""
     gravity: Gravity = (0.0, 0.0, -9.81)

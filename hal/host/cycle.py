@@ -537,6 +537,7 @@ class Cycle:
                 }
                 for name, unit in self.arms.items()
             },
+            "grippers": {name: unit.driver.statistics() for name, unit in self.grippers.items()},
         }
 
     def _do_reset_statistics(self) -> None:

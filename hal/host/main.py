@@ -20,7 +20,7 @@ from ..histogram import Histogram
 from ..specs import GroupSpec, from_json
 from .cycle import STOP_LIMIT, Cycle
 from .memory import SeriesBox
-from .process import Channel, SharedMemory, pack_error
+from .process import Channel, SharedMemory, end_by_signal, pack_error
 from .records import AppRecord, GroupMemory
 from .scheduling import describe, is_realtime, prepare_process
 
@@ -232,6 +232,8 @@ class HostProcess:
         self._state_every = max(1, round(spec.rate_hz / STATES_HZ))
         self._snapshot_every = max(1, round(spec.rate_hz / SNAPSHOTS_HZ))
         self.closing = False
+        self._ended_by = 0
+        """Number of the signal that ends this process; 0 for none."""
         self._resting = False
         self._give_up_at = math.inf
         self._owed: int | None = None
@@ -247,11 +249,14 @@ class HostProcess:
 
     def run(self) -> None:
         """Open the devices, cycle until closed, stop the arms, close the devices."""
-        signal.signal(signal.SIGTERM, self._terminate)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._terminate)
         cycle = self.cycle
         try:
             self._alarm()
             cycle.open(self.pace.now())
+            if self._ended_by:
+                return
             prepare_process(self.realtime)
             self.pace.restart()
             self._publish(self.pace.now())
@@ -265,6 +270,8 @@ class HostProcess:
         finally:
             self._alarm()
             cycle.close()
+            if self._ended_by:
+                end_by_signal(self._ended_by)
 
     def _cycle_until_closed(self) -> None:
         while not self._is_over():
@@ -291,7 +298,7 @@ class HostProcess:
             signal.alarm(HANG)
 
     def _terminate(self, signum: int, frame: object) -> None:
-        self.closing = True
+        self.closing, self._ended_by = True, signum
         self.pace.run_free()
 
     def _turn(self) -> None:

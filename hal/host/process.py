@@ -14,6 +14,7 @@ import contextlib
 import json
 import mmap
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -36,6 +37,7 @@ __all__ = [
     "Child",
     "SharedMemory",
     "child_main",
+    "end_by_signal",
     "fill_standard_descriptors",
     "pack_error",
     "serve",
@@ -57,6 +59,13 @@ _GOODBYE = 0.5
 """A child that does not take the message that ends it within so long, s, is stopped or hangs."""
 _SLICE = 0.2
 """s that a thread waits for an answer before it checks that the child is alive."""
+_REAPED = 1.0
+"""s after which a process that has closed its connection has ended, too."""
+_SIGNALS: dict[int, str] = {
+    signal.SIGKILL: "; if no one sent it, the memory may have run out: see dmesg",
+    signal.SIGALRM: ": a library did not return",
+}
+"""What a signal that ends a process means."""
 _IDLE = 0.5
 """s that :func:`serve` waits for a message before it checks that the app is alive."""
 
@@ -64,6 +73,20 @@ _IDLE = 0.5
 def _library() -> tuple[str, int]:
     """Return which copy of this library a process runs: its folder, and the layout of its shared memory."""
     return os.path.realpath(os.path.dirname(errors.__file__)), records.LAYOUT
+
+
+def _describe_status(status: int) -> str:
+    """Return an exit status as text; one below 0 is the number of the signal that ended the process."""
+    names = {-number: number.name for number in signal.Signals}
+    return names.get(status, f"status {status}") + _SIGNALS.get(-status, "")
+
+
+def end_by_signal(number: int) -> None:
+    """End this process by a signal that it has caught, so that its parent sees which one it was."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
 
 
 class ChannelClosed(ConnectionLost):
@@ -256,10 +279,11 @@ class Child:
         )
         theirs.close()
         self.ready: Any = None
-        self._closing = False
+        self._started = self._closing = False
         try:
             self.channel.send(config)
         except ConnectionLost:
+            self._wait_end(_REAPED)
             self.check()
             raise
 
@@ -276,13 +300,16 @@ class Child:
     def wait_ready(self, timeout: float = START_TIMEOUT) -> Any:
         """Wait until the child is ready, and return what it reports. Raises the error that stopped its start."""
         self.ready = self._wait_answer(None, timeout, "get ready")["ready"]
+        self._started = True
         return self.ready
 
     def check(self) -> None:
-        """Raise ConnectionLost, with the last lines that the child printed, if it has ended."""
+        """Raise ConnectionLost, with how the child ended and the last lines that it printed, if it has ended."""
         status = self.process.poll()
         if status is not None:
-            raise ConnectionLost(f"the {self.name} process ended (status {status}){self._tail()}", code="process_ended")
+            when = "" if self._started else " while it started"
+            text = f"the {self.name} process ended{when} ({_describe_status(status)}){self._tail()}"
+            raise ConnectionLost(text, code="process_ended")
 
     def request(self, method: str, params: dict[str, Any] | None = None, timeout: float = REQUEST_TIMEOUT) -> Any:
         """Send a request and return its answer.
@@ -345,7 +372,7 @@ class Child:
                 return False
             self._sort(message)
         except ChannelClosed:
-            self._wait_end(1.0)
+            self._wait_end(_REAPED)
             self.check()
             raise
         finally:
@@ -496,6 +523,8 @@ def child_main(target: str, fds: Sequence[int], library: Sequence[Any]) -> None:
         main(channel, memories, config)
     except ChannelClosed:
         pass
+    except KeyboardInterrupt:
+        end_by_signal(signal.SIGINT)
     except BaseException as error:
         status = 1
         traceback.print_exc()

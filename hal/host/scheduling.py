@@ -74,7 +74,7 @@ def describe() -> str:
 def yield_to_others(nice: int) -> None:
     """Give this process a lower priority, no claim to run at once, and all processors but the first.
 
-    The last of these matters most for a servo at 1 kHz beside cameras (``benchmarks/real_time.py``).
+    The last of these matters most for a servo at 1 kHz beside cameras (``python -m benchmarks real_time``).
     """
     os.nice(nice)
     with contextlib.suppress(AttributeError, OSError):  # Linux only

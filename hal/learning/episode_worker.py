@@ -20,18 +20,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import CommandError, ConfigError, ConnectionLost, DeviceNotFound, DriverMissing, HalError, NotSupported
-from ..host.process import Channel, SharedMemory, pack_error, serve
+from ..host.process import Channel, SharedMemory, serve
 from ..recording import Dataset, Recorder
 from ..recording.finish import finalise
 from ..recording.layout import MOVES, DatasetLayout, lock_dataset
 from .episode import reset_scene
 from .policy import Policy, PolicyRunner, is_made_with_rig, load_object, load_policy
+from .uploads import EpisodeUploader, is_address
 
 if TYPE_CHECKING:
     from ..rig import Rig
     from ..robot import Robot
 
-__all__ = ["EpisodeRecipe", "EpisodeResult", "EpisodeWorker", "clean_part", "main"]
+__all__ = ["EpisodeRecipe", "EpisodeResult", "EpisodeWorker", "check_recipe", "clean_part", "main"]
 
 _MISTAKES = (ConfigError, DeviceNotFound, DriverMissing, NotSupported)
 """Errors that no episode can be about: the skill, or the installation, is wrong."""
@@ -102,18 +103,24 @@ class EpisodeWorker:
 
     Args:
         recipe: Fields of an :class:`EpisodeRecipe`.
-        folder: The worker's dataset, made with the first episode.
+        folder: The worker's dataset, made with the first episode; or an address, to which the episodes of a dataset in
+            a temporary folder are uploaded.
         path: Further entries of ``sys.path``, where the user's modules are.
+        home: Working directory of the program. A rig file in it that this computer lacks is taken from the same place
+            in the working directory here.
 
     Raises:
-        CommandError: A module or function of the recipe cannot be imported.
+        CommandError: A module or function of the recipe cannot be imported, or the address is wrong.
+        DriverMissing: fsspec, or its package for this kind of address, is not installed.
     """
 
-    def __init__(self, recipe: dict[str, Any], folder: str, path: Sequence[str] = ()) -> None:
+    def __init__(self, recipe: dict[str, Any], folder: str, path: Sequence[str] = (), home: str = "") -> None:
         sys.path.extend(entry for entry in path if entry not in sys.path)
         self.recipe = EpisodeRecipe(**recipe)
-        self.folder = folder
         r = self.recipe
+        self._rig = r.rig | {"config": _file_here(r.rig["config"], home)}
+        self._uploader = EpisodeUploader(folder) if is_address(folder) else None
+        self._folder = folder
         places = {name: getattr(r, name) for name in ("policy", "skill", "reset", "success")}
         self._functions = {name: load_object(place, f"--{name}") for name, place in places.items() if place}
         self._policy: Policy | None = None
@@ -131,7 +138,10 @@ class EpisodeWorker:
         r = self.recipe
         seed = r.seed + number
         _seed_everything(seed)
-        with hal.open(**r.rig, clock="lock_step", pad="none") as rig:
+        if self._uploader is not None and self._uploader.is_full:
+            self._close_recorder()
+            self._uploader.begin()
+        with hal.open(**self._rig, clock="lock_step", pad="none") as rig:
             robot = rig.robots[r.robot or next(iter(rig.robots))]
             generator = np.random.default_rng(seed)
             try:
@@ -154,18 +164,19 @@ class EpisodeWorker:
                     raise ConnectionLost(f"{status.dropped} rows were lost: {status.trouble}", code="rows_lost")
             else:
                 recorder.save(success, wait=True)
+                if self._uploader is not None:
+                    self._uploader.upload(number, success)
         spent = time.perf_counter() - start
         return vars(EpisodeResult(number, seed, success, ended, reason, status.frames, spent))
 
-    def make_packed(self, number: int) -> dict[str, Any]:
-        """Do the same as :meth:`make`; return ``{"result": ...}``, or ``{"error": ...}`` as plain data."""
-        try:
-            return {"result": self.make(number)}
-        except Exception as error:
-            return {"error": pack_error(error)}
-
     def close(self) -> None:
         """End the recorder. Idempotent."""
+        self._close_recorder()
+        if self._uploader is not None:
+            self._uploader.close()
+            self._uploader = None
+
+    def _close_recorder(self) -> None:
         if self._recorder is not None:
             self._recorder.close()
             self._recorder = None
@@ -174,9 +185,8 @@ class EpisodeWorker:
         """Return the recorder, for this rig; its process is started once."""
         r = self.recipe
         if self._recorder is None:
-            self._recorder = Recorder(
-                rig, self.folder, r.fps, r.task, cameras=r.cameras, streams=r.streams, codec=r.codec
-            )
+            folder = self._folder if self._uploader is None else self._uploader.folder
+            self._recorder = Recorder(rig, folder, r.fps, r.task, cameras=r.cameras, streams=r.streams, codec=r.codec)
             self._recorder.source = lambda: "policy" if r.policy else "program"
         else:
             self._recorder.switch_rig(rig)
@@ -228,6 +238,14 @@ class EpisodeWorker:
             detach()
 
 
+def _file_here(config: Any, home: str) -> Any:
+    """Return where a rig file of a program in the folder ``home`` is on this computer; anything else as it is."""
+    path = Path(str(config))
+    if home and path.is_absolute() and not path.exists() and path.is_relative_to(home):
+        return str(Path.cwd() / path.relative_to(home))
+    return config
+
+
 def _seed_everything(seed: int) -> None:
     """Seed the global generators, for user code that uses them."""
     random.seed(seed)
@@ -273,11 +291,24 @@ def clean_part(folder: str | Path, recipe: dict[str, Any]) -> dict[int, bool | N
     found: dict[int, bool | None] = {}
     for episode in episodes:
         info = episode.info["info"]
-        made = info.get("recipe")
-        if made != recipe:
-            raise CommandError(f"{layout.root} {_difference(made, recipe)}; choose a new folder", code="other_recipe")
+        check_recipe(str(layout.root), info.get("recipe"), recipe)
         found[int(info["episode"])] = episode.success
     return found
+
+
+def check_recipe(place: str, made: Any, recipe: dict[str, Any]) -> None:
+    """Check that episodes were generated with a recipe.
+
+    Args:
+        place: Where they are.
+        made: Fields of the recipe that they were generated with, or None.
+        recipe: Fields of the other one.
+
+    Raises:
+        CommandError: They were not (code ``other_recipe``).
+    """
+    if made != recipe:
+        raise CommandError(f"{place} {_difference(made, recipe)}; choose another place", code="other_recipe")
 
 
 def _difference(made: Any, recipe: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from ..errors import CommandError, ConnectionLost, HalError, MotionStopped, Poli
 from ..histogram import Histogram
 from ..observation import Observation
 from ..types import Trip
+from .episode import stands_in_world
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -154,8 +155,8 @@ class PolicyOutcome:
     """Result of one episode."""
 
     success: bool | None
-    """Whether it succeeded; None if that is not known. False after an error or a stop of the policy's, or if time ran
-    out before ``success`` was true."""
+    """Whether it succeeded; None if that is not known. False after an error or a stop of the policy's, after a fault of
+    a simulated arm, or if time ran out before ``success`` was true."""
     ended: str
     """``success``, ``failure`` (marked by the operator), ``time``, ``stopped`` or ``error``."""
     reason: str
@@ -273,7 +274,8 @@ class PolicyRunner:
             on_turn: Called with the policy's driving time, s, in each turn, also in pauses.
         """
         self.rig.forget_observations()
-        tally = _Tally(judged=self._success is not None)
+        placed = all(stands_in_world(self.rig, robot) for robot in self.robots.values())
+        tally = _Tally(judged=self._success is not None, faults_fail=placed)
         controls = {name: robot.control(**self._terms) for name, robot in self.robots.items()}
         stopped: list[str] = []
         try:
@@ -418,8 +420,8 @@ def _policy_errors(kind: type[Exception] | tuple[type[Exception], ...]) -> Itera
 class _Tally:
     """Counts of one episode."""
 
-    def __init__(self, judged: bool) -> None:
-        self._judged = judged
+    def __init__(self, judged: bool, faults_fail: bool) -> None:
+        self._judged, self._faults_fail = judged, faults_fail
         self.seconds = 0.0
         self.repeated = 0
         self.inference = Histogram(1e-4, 20_000)
@@ -443,7 +445,8 @@ class _Tally:
 
     def outcome(self) -> PolicyOutcome:
         marks = {"success": True, "failure": False, "error": False, "time": False if self._judged else None}
-        if getattr(self._error, "code", "") in POLICY_STOPS:
+        fault = self._faults_fail and isinstance(self._error, RobotFault)
+        if fault or getattr(self._error, "code", "") in POLICY_STOPS:
             marks["stopped"] = False
         return PolicyOutcome(
             success=marks.get(self._ended),

@@ -6,12 +6,13 @@ import logging
 import os
 import sys
 import tempfile
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
-from ..errors import ConnectionLost, DriverMissing
-from ..host.process import unpack_error
+from ..errors import CommandError, ConnectionLost, DriverMissing
+from ..host.process import pack_error, unpack_error
 from .episode_worker import EpisodeResult, EpisodeWorker
 from .generate import LONGEST, WorkerHandle
 
@@ -19,8 +20,8 @@ __all__ = ["RayCluster", "RayWorker"]
 
 _STORE = 80_000_000
 """Memory for Ray's objects on a cluster that is started here, bytes: close to Ray's least. Results are small."""
-
-
+_START = 120.0
+"""Longest time in which a worker that has a place must be ready, s: importing a policy may take a while."""
 _CLOSING = 60.0
 """Time in which a worker must have closed its dataset, s."""
 
@@ -32,24 +33,29 @@ class RayCluster:
         address: Of the cluster, as :func:`ray.init` takes it; ``local`` starts one on this computer, with neither
             dashboard nor usage statistics, which ends with the statement.
         workers: Number of workers that it must have room for, if it is started here.
+        gpus: Graphics cards of each worker; 0.25 is a quarter of one. Ray shows a worker no others.
+        runtime_env: Ray's description of what the workers need: ``working_dir``, ``pip``, ``env_vars`` ...
 
     Raises:
         DriverMissing: Ray is not installed.
         ConnectionLost: The cluster does not answer (code ``no_cluster``).
     """
 
-    def __init__(self, address: str, workers: int) -> None:
+    def __init__(
+        self, address: str, workers: int, *, gpus: float = 0.0, runtime_env: Mapping[str, Any] | None = None
+    ) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when Ray is imported
         try:
             import ray
         except ImportError as error:
             raise DriverMissing("ray is not installed: pip install 'robot-hal[ray]'", name="ray") from error
         self._ray: Any = ray
-        own: dict[str, Any] = {}
+        self._gpus = gpus
+        own: dict[str, Any] = {"runtime_env": dict(runtime_env)} if runtime_env else {}
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         if address == "local":
             self._folder = tempfile.TemporaryDirectory(prefix="hal-ray-", ignore_cleanup_errors=True)
-            own = {
+            own |= {
                 "_temp_dir": self._folder.name,
                 "num_cpus": workers,
                 "include_dashboard": False,
@@ -73,28 +79,47 @@ class RayCluster:
 
     def start_worker(self, recipe: dict[str, Any], folder: str, index: int) -> RayWorker:
         """Start a worker; see :data:`~hal.learning.generate.StartWorker`."""
-        return RayWorker(self._ray, recipe, folder)
+        return RayWorker(self._ray, recipe, folder, self._gpus)
 
 
 class RayWorker(WorkerHandle):
-    """A worker in a process of a Ray cluster, on one of its processors."""
+    """A worker in a process of a Ray cluster, on one of its processors, as soon as there is room for it."""
 
-    def __init__(self, ray: Any, recipe: dict[str, Any], folder: str) -> None:
+    def __init__(self, ray: Any, recipe: dict[str, Any], folder: str, gpus: float = 0.0) -> None:
         self._ray = ray
-        path = [os.path.abspath(entry) for entry in sys.path]
-        self._actor = ray.remote(num_cpus=1, max_restarts=0)(EpisodeWorker).remote(recipe, folder, path)
+        self._config = recipe, folder, [os.path.abspath(entry) for entry in sys.path], os.getcwd()
+        self._actor = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0)(_EpisodeActor).remote()
+
+    def wait_ready(self) -> None:
+        """Block until the cluster has had room for the worker, and it is ready; see :meth:`.WorkerHandle.wait_ready`.
+
+        Raises:
+            ConnectionLost: See there.
+            CommandError: A node cannot make the runtime environment (code ``bad_runtime_env``), or as
+                :class:`.EpisodeWorker`.
+            DriverMissing: A node lacks a library.
+        """
+        try:
+            self._ask(self._actor.is_there, None)
+        except self._ray.exceptions.RuntimeEnvSetupError as error:
+            raise CommandError(f"the runtime environment cannot be made: {error}", code="bad_runtime_env") from error
+        self._ask(self._actor.start, _START, *self._config)
 
     def make(self, number: int) -> EpisodeResult:
         """Make an episode; see :meth:`.WorkerHandle.make`."""
+        return EpisodeResult(**self._ask(self._actor.make, LONGEST, number))
+
+    def _ask(self, method: Any, timeout: float | None, *arguments: Any) -> Any:
+        """Return the answer of the worker. Raises its error, or ConnectionLost if it does not answer."""
         try:
-            answer = self._ray.get(self._actor.make_packed.remote(number), timeout=LONGEST)
+            answer = self._ray.get(method.remote(*arguments), timeout=timeout)
         except self._ray.exceptions.RayActorError as error:
             raise ConnectionLost(f"the worker's process ended: {error}", code="process_ended") from error
         except self._ray.exceptions.GetTimeoutError as error:
-            raise ConnectionLost(f"the worker made no episode within {LONGEST:g} s", code="process_silent") from error
+            raise ConnectionLost(f"the worker did not answer within {timeout:g} s", code="process_silent") from error
         if "error" in answer:
             raise unpack_error(answer["error"])
-        return EpisodeResult(**answer["result"])
+        return answer["result"]
 
     def kill(self) -> None:
         """End the process at once."""
@@ -102,6 +127,36 @@ class RayWorker(WorkerHandle):
 
     def close(self) -> None:
         """End the recorder of the worker, then its process."""
-        with suppress(self._ray.exceptions.RayActorError, self._ray.exceptions.GetTimeoutError):
-            self._ray.get(self._actor.close.remote(), timeout=_CLOSING)
+        with suppress(ConnectionLost):
+            self._ask(self._actor.close, _CLOSING)
         self.kill()
+
+
+class _EpisodeActor:
+    """The process of a worker. Each method returns ``{"result": ...}``, or ``{"error": ...}`` as plain data."""
+
+    def is_there(self) -> dict[str, Any]:
+        return {"result": None}
+
+    def start(self, *config: Any) -> dict[str, Any]:
+        """Make the :class:`.EpisodeWorker`."""
+
+        def start() -> None:
+            self.worker = EpisodeWorker(*config)
+
+        return _packed(start)
+
+    def make(self, number: int) -> dict[str, Any]:
+        """Make an episode."""
+        return _packed(lambda: self.worker.make(number))
+
+    def close(self) -> dict[str, Any]:
+        """End the worker's recorder."""
+        return _packed(self.worker.close)
+
+
+def _packed(call: Callable[[], Any]) -> dict[str, Any]:
+    try:
+        return {"result": call()}
+    except Exception as error:
+        return {"error": pack_error(error)}

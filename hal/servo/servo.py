@@ -10,6 +10,7 @@ that must not follow is brought to rest by the smoother's time-optimal stop and 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import dist, hypot, isfinite
 from typing import Any
 
@@ -46,6 +47,21 @@ _ABSURD = 1e3
 
 _BEYOND = 1.0
 """Joint positions this far beyond the joint's range are an invalid reading, rad."""
+
+
+@dataclass(slots=True)
+class _Course:
+    """How far a session has come."""
+
+    seq: int = 0
+    """Number of the newest command that was handled or is no longer valid."""
+    ending: bool = False
+    braking: float = 0.0
+    """Time for which a controller has held the session open although it is closing, s."""
+    stuck: float = 0.0
+    """Time for which its motion has made no progress, s."""
+    resting: int = 0
+    """Number of ticks for which it has been at rest while closing."""
 
 
 class Servo:
@@ -97,10 +113,10 @@ class Servo:
         self._whole: PathMotion | PlannedMotion | None = None
         """The one motion of a session that takes no commands; None in a session that does."""
         self._session: Session | None = None
+        self._course = _Course()
         self._motion: ServoMotion | None = None
         """The motion that moves the arm; None until the first command."""
         self._anchored = False
-        self._ending = False
         self._followed = False
         """Whether a motion moved the arm in the last tick."""
         self.possible = True
@@ -109,14 +125,6 @@ class Servo:
         """Time for which the driver has held back the set-points of such a motion, s."""
         self._t_tick: float | None = None
         """Time of the last tick, s."""
-        self._seq = 0
-        """Number of the newest command that was handled or is no longer valid."""
-        self._braking = 0.0
-        """Time for which a controller has held a session open that is closing, s."""
-        self._stuck = 0.0
-        """Time for which the motion of the session has made no progress, s."""
-        self._resting = 0
-        """Number of ticks for which a session that is closing has been at rest."""
         self._extrapolates = extrapolates
         self._ahead: Setpoint | None = None
         """The set-point that the next reading is answered with."""
@@ -200,11 +208,8 @@ class Servo:
             self._path.set_goal(session.move_to)
             self._whole = self._path
         self._session = session
-        self._ending = False
-        self._resting = 0
-        self._braking = self._stuck = 0.0
+        self._course = _Course()
         self._ahead = None
-        self._seq = 0
         self.report.target_seq = self.report.refused = 0
         self.report.arrived = self.report.off_path = False
         self.report.progress, self.report.held_back = 0.0, Limited.NONE
@@ -220,8 +225,8 @@ class Servo:
 
     def close_session(self) -> None:
         """Close the session: brake, then be idle."""
-        if self._session is not None and not self._ending:
-            self._ending = True
+        if self._session is not None and not self._course.ending:
+            self._course.ending = True
             self._watchdog.close_session()
             self._forget_goals()
 
@@ -245,22 +250,13 @@ class Servo:
         device = self._device if compared else self._find_trip(now, reading)
         if session is None:
             self._anchoring.note_rest(None if device else reading.q_commanded)
-        torque = self._torque
-        known = self._is_known(reading, device)
-        self.possible = known or device is Trip.DEVICE_LOST
-        if torque.active:
-            torque.observe(reading if known else None)
-            device = device or self._overruns()
-            if device:
-                self._compliance.active = False  # torques brake it, as in any other session
-        else:
-            if known:
-                torque.q, torque.dq = reading.q, reading.dq  # where torques would begin
-            if session is not None and not compared:
-                self._compare(reading, device)
+        streamed = session is not None and not self._torque.active
+        device = self._observe(reading, device)
+        if streamed and not compared:
+            self._compare(reading, device)
         self._watchdog.update(now, inbox, self._at_rest(), device, late)
         faulty = device is _FAULT
-        if session is None or (self._ending and self._finished()):
+        if session is None or (self._course.ending and self._finished()):
             self._idle(RobotStatus.FAULT if faulty else RobotStatus.IDLE)
             return None
         self._accept_command(now, session, inbox.command)
@@ -271,6 +267,20 @@ class Servo:
             else:
                 self._anchoring.note_given(setpoint)
         return setpoint
+
+    def _observe(self, reading: Reading, device: Trip) -> Trip:
+        """Take what the arm measured; return ``device``, or the trip of an arm that torques have driven too far."""
+        torque = self._torque
+        known = self._is_known(reading, device)
+        self.possible = known or device is Trip.DEVICE_LOST
+        if torque.active:
+            torque.observe(reading if known else None)
+            device = device or self._overruns()
+            if device:
+                self._compliance.active = False  # torques brake it, as in any other session
+        elif known:
+            torque.q, torque.dq = reading.q, reading.dq  # where torques would begin
+        return device
 
     def answer(self, now: float, reading: Reading) -> Setpoint | None:
         """Return at once the set-point that a device which extrapolates gets after this reading.
@@ -304,7 +314,7 @@ class Servo:
         """Compare a reading with what was given; returns whether the set-point was corrected."""
         self._corrected = self._anchoring.check_report(reading, device)
         if self._corrected:
-            self._resting = 0
+            self._course.resting = 0
             self.report.reanchored += 1
             self._envelope.limited = Limited.REANCHORED
             if self._motion is not None:
@@ -357,7 +367,7 @@ class Servo:
         self._compliance.active = False
         if self._torque.active:
             self._torque.observe(None)
-        if self._session is None or (self._ending and self._finished()):
+        if self._session is None or (self._course.ending and self._finished()):
             self._idle(RobotStatus.LOST)
             return None
         self._forget_goals()
@@ -425,46 +435,50 @@ class Servo:
 
     def _accept_command(self, now: float, session: Session, command: CommandRecord | None) -> None:
         """Accept the newest command if it belongs to this session and is valid; else count it as refused."""
-        watchdog = self._watchdog
-        mine = command is not None and command.session == session.id
-        if not watchdog.allowed or watchdog.renewed:
+        watchdog, course = self._watchdog, self._course
+        allowed, renewed = watchdog.allowed, watchdog.renewed
+        if not allowed or renewed:
             self._forget_goals()
         if self._whole is not None:
-            if watchdog.allowed and self._motion is None:
+            if allowed and self._motion is None:
                 self._whole.start()
                 self._motion = self._whole
             return
-        stale = not watchdog.allowed or (watchdog.renewed and session.deadman)
-        if stale and command is not None and mine:  # what was sent before the press is not resumed after it
-            self._seq = max(self._seq, command.seq)
-        if not watchdog.allowed or command is None or not mine or command.seq <= self._seq:
+        if command is None or command.session != session.id or command.seq <= course.seq:
             return
-        if command.kind is Kind.JOINT_CHUNK and not command.values:
-            return  # overtaken by the next chunk, whose command follows
-        self._seq = command.seq
-        motion = self._motions.get(command.kind)
-        compliance = self._compliance
-        if (
-            motion is None
-            or (compliance.chosen and motion is self._torque)
-            or not is_timely(now, command)
-            or not motion.usable(command.values)
-        ):
-            self.report.refused = command.seq
-            return
-        if motion is not self._motion:
-            by_torques = self._torque.active and not compliance.active
-            if by_torques and self._torque.resting:
-                self._leave_torques()
-                by_torques = False
-            if by_torques or motion.too_far(command.values):
+        if not allowed or (renewed and session.deadman):  # what was sent before the press is not resumed after it
+            course.seq = command.seq
+        elif command.values or command.kind is not Kind.JOINT_CHUNK:  # else overtaken by the next chunk, which follows
+            course.seq = command.seq
+            if not self._follow(now, command):
                 self.report.refused = command.seq
-                return
-            motion.start()
-            self._motion = motion
+
+    def _follow(self, now: float, command: CommandRecord) -> bool:
+        """Follow a command from now on; return whether that is possible."""
+        motion = self._motions.get(command.kind)
+        if motion is None or (self._compliance.chosen and motion is self._torque):
+            return False
+        if not is_timely(now, command) or not motion.usable(command.values):
+            return False
+        if motion is not self._motion and not self._start(motion, command.values):
+            return False
         motion.accept(command)
-        watchdog.expect(command)
+        self._watchdog.expect(command)
         self.report.target_seq = command.seq
+        return True
+
+    def _start(self, motion: ServoMotion, values: Floats) -> bool:
+        """Replace the motion by one that begins with these values; return whether it may begin here."""
+        torque = self._torque
+        by_torques = torque.active and not self._compliance.active
+        if by_torques and torque.resting:
+            self._leave_torques()
+            by_torques = False
+        if by_torques or motion.too_far(values):
+            return False
+        motion.start()
+        self._motion = motion
+        return True
 
     def _move(self, now: float, status: RobotStatus | None) -> Setpoint | None:
         """Advance the motion or the stop by one tick; ``status`` overrides the usual one."""
@@ -486,12 +500,7 @@ class Servo:
         else:
             if self._followed:
                 report.t_stop = now
-            by_torques = self._torque.active and not compliance.active
-            if by_torques and self._torque.brake():
-                self._leave_torques()
-                by_torques = False
-            if not by_torques and not (self._whole is self._planned and self._planned.brake()):
-                smoother.stop()
+            self._brake()
             usual = RobotStatus.HOLDING if self._at_rest() else RobotStatus.STOPPING
             if watchdog.trip:
                 usual = RobotStatus.TRIPPED
@@ -506,6 +515,15 @@ class Servo:
             return self._torque.setpoint()
         return Setpoint(smoother.q, smoother.dq, smoother.ddq, None, q_from)
 
+    def _brake(self) -> None:
+        """Advance the stop by one tick: along a planned path, by torques, or joint by joint."""
+        by_torques = self._torque.active and not self._compliance.active
+        if by_torques and self._torque.brake():
+            self._leave_torques()
+            by_torques = False
+        if not by_torques and not (self._whole is self._planned and self._planned.brake()):
+            self._smoother.stop()
+
     def _prepare_compliance(self, motion: ServoMotion | None) -> None:
         """Let the controller of the session take over when the arm is to move, and let go when the session closes."""
         compliance, torque = self._compliance, self._torque
@@ -515,19 +533,20 @@ class Servo:
             return
         if compliance.hold_back() and motion is not None:
             motion.reanchored()
-        if self._ending and self._smoother.at_rest():
-            self._braking += self._smoother.dt
+        if self._course.ending and self._smoother.at_rest():
+            self._course.braking += self._smoother.dt
             if torque.still:
                 self._leave_torques()  # to positions where it was measured, so without a jerk
-            elif self._braking > BRAKE_LIMIT:
+            elif self._course.braking > BRAKE_LIMIT:
                 compliance.active = False  # torques brake it
 
     def _report_whole(self, motion: PathMotion | PlannedMotion) -> None:
         """Report how far the motion of the session is."""
         report = self.report
         report.arrived = motion.arrived and (not self._compliance.active or self._torque.still)
-        self._stuck = 0.0 if motion.progress != report.progress else self._stuck + self._smoother.dt
-        motion.lost = motion.lost or (self._stuck > PATIENCE and not motion.arrived)
+        course = self._course
+        course.stuck = 0.0 if motion.progress != report.progress else course.stuck + self._smoother.dt
+        motion.lost = motion.lost or (course.stuck > PATIENCE and not motion.arrived)
         report.progress = motion.progress
         report.held_back |= self._envelope.limited
         report.off_path = motion.lost
@@ -547,11 +566,11 @@ class Servo:
         if self._torque.active and self._torque.blind:  # the device was left alone: it holds by itself
             self._leave_torques()
         at_rest = self._smoother.at_rest() and not self._torque.active
-        self._resting = self._resting + 1 if at_rest else 0
-        if self._resting < (3 if self._extrapolates else 1):  # computed, given, and seen to be taken
+        course = self._course
+        course.resting = course.resting + 1 if at_rest else 0
+        if course.resting < (3 if self._extrapolates else 1):  # computed, given, and seen to be taken
             return False
         self._session = None
-        self._ending = False
         self._anchoring.forget()
         return True
 

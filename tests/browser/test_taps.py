@@ -51,13 +51,14 @@ def page(bench: Bench, page: Browser) -> Browser:
 def seen(bench: Bench) -> Iterator[list[PadState]]:
     """Every state of the pad that the app could see."""
     found: list[PadState] = []
-    ended = threading.Event()
+    ended, changed = threading.Event(), threading.Event()
+    bench.session.pad.wake(changed)
 
     def collect() -> None:
         while not ended.is_set():
-            state = bench.session.pad.wait(0.05)
-            if not found or state is not found[-1]:
-                found.append(state)
+            if changed.wait(0.05):
+                changed.clear()
+                found.append(bench.session.pad.state())
 
     thread = threading.Thread(target=collect)
     thread.start()

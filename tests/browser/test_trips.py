@@ -70,7 +70,7 @@ def test_a_frozen_browser(bench: Bench, moving: Browser) -> None:
     event = moving.freeze()
     late = braking_after(bench, event)
     assert bench.trip in ("deadman_silent", "deadman_lost"), "the servo and the console notice at about the same time"
-    assert 0.05 < late < 1.0  # how late exactly is for benchmarks/console.py
+    assert 0.05 < late < 1.0  # how late exactly is for python -m benchmarks console
     before = bench.tcp.copy()
     moving.thaw()
     wait_for(lambda: moving.facts.get("connected"), "the page to answer")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,7 @@ from tempfile import TemporaryDirectory
 from hal.drivers.mock.gamepad import MockPad
 from hal.testing import PadBench, pad_spec
 
-__all__ = ["mock_pad", "playback_pad", "terminal_keys_held", "terminal_steps", "web_pad"]
+__all__ = ["mock_pad", "playback_pad", "terminal_steps", "web_pad"]
 
 
 @contextmanager
@@ -102,42 +101,12 @@ def web_pad() -> Iterator[PadBench]:
 
 @contextmanager
 def terminal_steps() -> Iterator[PadBench]:
-    """The keys of a terminal that reports no key release."""
+    """The keys of a terminal."""
     from terminal_kit import FarEnd
 
     from hal.drivers.terminal.pad import TerminalPad
 
     with FarEnd() as far:
-        driver = TerminalPad(pad_spec(driver="terminal", options={"tty": far.path, "mode": "step"}))
+        driver = TerminalPad(pad_spec(driver="terminal", options={"tty": far.path}))
         yield PadBench(driver=driver, press=lambda: far.put("1"), lose=far.hang_up)
-        driver.close()
-
-
-@contextmanager
-def terminal_keys_held() -> Iterator[PadBench]:
-    """The keys of a terminal that reports key releases and its focus."""
-    from terminal_kit import FarEnd
-
-    from hal.drivers.terminal.pad import TerminalPad
-
-    with FarEnd(kitty=True) as far:
-        driver = TerminalPad(pad_spec(driver="terminal", options={"tty": far.path, "mode": "auto"}))
-
-        def focus(on: bool) -> None:
-            far.put("\x1b[I" if on else "\x1b[O")
-
-        def freeze() -> None:
-            far.silent = True
-            time.sleep(0.05)  # input that was under way
-
-        yield PadBench(
-            driver=driver,
-            real_time=True,
-            patience=2.0,
-            press=lambda: far.put("\x1b[49;1:1u"),
-            release=lambda: far.put("\x1b[49;1:3u"),
-            lose=lambda: focus(False),
-            restore=lambda: focus(True),
-            freeze=freeze,
-        )
         driver.close()

@@ -43,7 +43,7 @@ from .can_arms import piper_arm, piper_gripper
 from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
-from .pads import mock_pad, playback_pad, terminal_keys_held, terminal_steps, web_pad
+from .pads import mock_pad, playback_pad, terminal_steps, web_pad
 
 NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simulation: there is no link")
 
@@ -244,16 +244,12 @@ class TestWebPad(GamepadContract):
 class TestTerminalSteps(
     GamepadContract,
     left_out={
-        "release": "such a terminal reports no key release: a press is one step",
+        "release": "a terminal reports no key release: a press is one step",
         "restore": "a closed terminal does not come back",
         "freeze": "nothing is held, so nothing needs to stay alive after the press",
     },
 ):
     bench = bench_of(terminal_steps)
-
-
-class TestTerminalKeysHeld(GamepadContract):
-    bench = bench_of(terminal_keys_held)
 
 
 class TestRecordedDualShock4(GamepadContract):

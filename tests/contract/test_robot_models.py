@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
+from benchmark_kit import load_benchmark
 from engines_kit import Engine
 
 import hal
@@ -20,9 +19,7 @@ from hal.testing import RobotBench, RobotContract
 
 from .benches import _robot_bench
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import robots  # type: ignore[import-not-found]  # benchmarks/robots.py
-
+robots = load_benchmark("robots")
 pytestmark = pytest.mark.slow
 ENTRIES = [entry for model in list_data("robots") for entry in robots.entries(model)]
 WITHOUT_TORQUES = ("so101", "xarm7")

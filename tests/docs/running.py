@@ -99,11 +99,11 @@ class Reader:
             options.setdefault("pad", str(find_data(*TOUR)))
         rig = self._open(*arguments, **options)
         self.rigs.append(rig)
-        whole: Callable[[float], Iterator[Any]] = rig.clock.rate
+        whole: Callable[..., Iterator[Any]] = rig.clock.rate
 
-        def rate(hz: float) -> Iterator[Any]:
+        def rate(*arguments: Any, **options: Any) -> Iterator[Any]:
             ours = sys._getframe(1).f_code.co_filename.endswith(".md")
-            return itertools.islice(whole(hz), TURNS) if ours else whole(hz)
+            return itertools.islice(whole(*arguments, **options), None if not ours else TURNS)
 
         rig.clock.rate = rate  # of this rig only
         return rig
@@ -149,18 +149,20 @@ class Reader:
         """What Python is to be started with; None for a command that is not run here."""
         if words[0] == "pytest" and any(word.endswith(".py") for word in words):
             return ["-m", "pytest", "-p", "no:cacheprovider", *words[1:]]
-        if words[0] == "hal-teleop" or words[:2] == ["python", "apps/teleop.py"]:
-            rest = words[1:] if words[0] == "hal-teleop" else words[2:]
-            endless = not {"--dry-run", "--help", "--duration"} & set(rest)
-            return ["-m", "hal.apps.teleop", *rest, *(["--duration", SECONDS] if endless else [])]
-        if words[:2] == ["python", "apps/collect.py"] and "--pad" in words:  # a recorded one: nobody need wait for it
+        start = ["-m", "hal.apps.main"]
+        if words[0] == "hal":
+            program, rest = words[1], words[2:]
+            start.append(program)
+        elif words[0] == "python" and words[1].startswith("apps/"):
+            program, rest, start = Path(words[1]).stem, words[2:], [str(ROOT / words[1])]
+        else:
+            return words[1:] if words[0] == "python" and not words[1].startswith("-") else None
+        if program == "teleop" and not {"--dry-run", "--help", "--duration"} & set(rest):
+            rest = [*rest, "--duration", SECONDS]
+        if program == "collect" and "--pad" in rest:  # a recorded one: nobody need wait for it
             quick = ["simulation.clock=lock_step", *small()]
-            return [str(ROOT / words[1]), *words[2:], *(word for one in quick for word in ("--set", one))]
-        if words[0] == "hal-check":
-            return ["-m", "hal.apps.check", *words[1:]]
-        if words[0] == "python" and not words[1].startswith("-"):
-            return [str(ROOT / words[1]) if words[1].startswith(("apps/", "benchmarks/")) else words[1], *words[2:]]
-        return None
+            rest = [*rest, *(word for one in quick for word in ("--set", one))]
+        return [*start, *rest]
 
     def close(self) -> None:
         """Close what the document left open."""

@@ -10,6 +10,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from image import PROGRAM, TEXT, Image, archive
+
 from packages import Missing
 
 __all__ = ["Machine"]

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from image import image_for
 from machine import Machine
+
 from packages import Missing
 
 _HERE = Path(__file__).resolve().parent

@@ -1,6 +1,6 @@
 """Proofs on an emulated CAN arm with gravity: at rest, on a recorded drive, after the end of its program.
 
-Each starts an emulator of its own, on a rig with one arm called "arm". ``benchmarks/can_arm.py`` prints long versions.
+Each starts an emulator of its own, on a rig with one arm "arm". ``python -m benchmarks can`` prints long versions.
 """
 
 from __future__ import annotations

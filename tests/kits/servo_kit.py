@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from specs import panda
@@ -23,16 +20,6 @@ from hal.types import Limited, RobotStatus, Trip
 N = 7
 STILL = (0.0,) * N
 FAR = 1e9
-
-
-def load_streams() -> Any:
-    """The module ``benchmarks/servo_streams.py``."""
-    path = Path(__file__).parents[2] / "benchmarks" / "servo_streams.py"
-    spec = importlib.util.spec_from_file_location("servo_streams", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def tightened(limits: LimitsSpec, acceleration: float, jerk: float) -> LimitsSpec:

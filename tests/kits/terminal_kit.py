@@ -1,4 +1,4 @@
-"""The far end of a pseudo-terminal: a terminal emulator and the keys of its user."""
+"""The far end of a pseudo-terminal: its screen and the keys of its user."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ from typing import Any
 
 __all__ = ["FarEnd", "InTerminal", "wait_for"]
 
-_QUERY = re.compile(rb"\x1b\[([<>=?]?)([0-9;]*)(\$p|[uhlc])")
-
 
 def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0, every: float = 0.002) -> None:
     """Wait until ``condition`` holds; AssertionError after ``timeout`` s."""
@@ -32,23 +30,13 @@ def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0, ev
 
 
 class FarEnd:
-    """A terminal that answers queries from a thread of its own.
+    """A terminal: a thread of its own reads what is written to it."""
 
-    ``kitty`` terminals speak the Kitty keyboard protocol. ``silent`` stops all replies, as a cut link does.
-    """
-
-    def __init__(self, *, kitty: bool = False, reports_focus: bool = True, answers: bool = True, delay: float = 0.0):
+    def __init__(self) -> None:
         self.master, self.slave = pty.openpty()
         self.path = os.ttyname(self.slave)
-        self.kitty, self.reports_focus, self.delay = kitty, reports_focus, delay
-        self.silent = not answers
-        self.flags = [0]
-        """The stack of keyboard modes."""
-        self.focus = False
-        """Whether the focus is reported."""
         self.screen = b""
         """Everything that was written to it."""
-        self._seen = 0
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -88,35 +76,6 @@ class FarEnd:
                 self.screen += os.read(self.master, 65536)
             except OSError:
                 return
-            self._answer()
-
-    def _answer(self) -> None:
-        for found in _QUERY.finditer(self.screen, self._seen):
-            self._seen = found.end()
-            mark, digits, final = (part.decode() for part in found.groups())
-            numbers = [int(number) for number in digits.split(";") if number] or [0]
-            answer = self._obey(mark, numbers, final)
-            if answer and not self.silent:
-                if self.delay:
-                    time.sleep(self.delay)
-                os.write(self.master, answer.encode())
-
-    def _obey(self, mark: str, numbers: list[int], final: str) -> str:
-        if final == "c" and not mark:
-            return "\x1b[?62;22c"
-        if final == "u" and self.kitty:
-            if mark == ">":
-                self.flags.append(numbers[0])
-            elif mark == "<" and len(self.flags) > 1:
-                self.flags.pop()
-            elif mark == "?":
-                return f"\x1b[?{self.flags[-1]}u"
-        if final in "hl" and mark == "?" and numbers == [1004] and self.reports_focus:
-            self.focus = final == "h"
-        if final == "$p" and mark == "?" and self.kitty:
-            known = numbers == [1004] and self.reports_focus
-            return f"\x1b[?{numbers[0]};{(1 if self.focus else 2) if known else 0}$y"
-        return ""
 
     def hang_up(self) -> None:
         """Close the terminal's window."""
@@ -193,7 +152,6 @@ class InTerminal:
     def is_put_back(self) -> None:
         """Wait until no process has the terminal open and its settings are as before."""
         self.is_released()
-        wait_for(lambda: self.far.flags == [0] and not self.far.focus, "resetting the terminal")
         assert self.far.settings == self.before
         assert self.far.unread() == 0, "no input is left for the shell"
 

@@ -2,43 +2,91 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
+import contextlib
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from benchmark_kit import load_benchmark
 
 import hal
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "collisions.py"
-BENCHMARK = runpy.run_path(str(SCRIPT))
+collisions = load_benchmark("collisions")
 POINTED = [0.0, 0.6, 0.0, -1.2, 0.0, 1.8, 0.8]
 
 
 def test_two_arms_driven_at_each_other_stop_apart() -> None:
-    found = BENCHMARK["arms"](1)
+    found = collisions.arms(1)
     assert found["5 mm apart or more"] == found["came within 20 mm"] == 1
 
 
+OVER_THE_TABLE = [0.0, 0.45, 0.0, -2.1, 0.0, 2.55, 0.785]
+"""The hand points down, some 15 cm above the table."""
+
+
+@contextlib.contextmanager
+def over_the_table() -> Iterator[tuple[hal.Rig, Callable[[], tuple[float, bool]]]]:
+    """Open a rig whose arm must not touch the table; also yield a function that makes a step.
+
+    It returns the distance of the nearest pair, m, and whether something held the arm back to avoid a collision.
+    """
+    overrides = {"robots.panda.initial": OVER_THE_TABLE, "robots.panda.workspace": {}, "cameras": {}}
+    overrides |= {"collisions.boxes": ["table"]}
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=overrides) as rig:
+        panda = rig.robots["panda"]
+        model = panda.collisions.model
+
+        def step() -> tuple[float, bool]:
+            rig.clock.sleep(1 / 240)
+            state = panda.state()
+            model.place(state.q)
+            return float(model.distances().min()), hal.Limited.COLLISION in state.limited
+
+        rig.clock.sleep(0.2)
+        yield rig, step
+
+
 def test_torques_towards_the_table_are_stopped_before_its_margin() -> None:
-    found = BENCHMARK["torques"](3)
-    assert found["nearest of all, mm"] >= 10.0
-    assert found["stopped because of a collision"] == 2
+    """Constant torques: random ones, and those of forces down on the table."""
+    rng = np.random.default_rng(3)
+    stopped = []
+    for kind in ("force", "torques", "force"):
+        with over_the_table() as (rig, step):
+            panda, seen = rig.robots["panda"], []
+            force = ([0.0, 0.0, -1.0] + 0.5 * rng.normal(size=3)) * rng.uniform(2.0, 12.0)
+            tau = panda.kinematics.jacobian(OVER_THE_TABLE)[:3].T @ force
+            if kind == "torques":
+                tau = rng.normal(size=7) * [8.0, 8.0, 8.0, 8.0, 1.5, 1.5, 1.5]
+            with panda.control(rate_hz=100) as control, contextlib.suppress(hal.MotionStopped):
+                for _ in range(120):
+                    control.send(hal.JointTorque(tau))
+                    seen += [step(), step()]
+            seen += [step() for _ in range(60)]
+        assert min(distance for distance, _ in seen) >= 0.01
+        stopped.append(any(limited for _, limited in seen))
+    assert stopped.count(True) == 2
 
 
-def test_a_compliant_arm_that_is_pushed_beyond_the_margin_is_held() -> None:
-    free, pushed = BENCHMARK["pushes"](forces=(0.0, 20.0), names=("tcp 1000 N/m",)).values()
-    distance, end = free.split(" mm, ")
-    assert 9.95 <= float(distance) <= 11.0
-    assert end == "no trip"
-    distance, end = pushed.split(" mm, ")
-    assert float(distance) >= 5.0
-    assert end == "torque_limit"
+@pytest.mark.parametrize(("newtons", "least", "end"), [(0.0, 9.95e-3, ""), (20.0, 5e-3, "torque_limit")])
+def test_a_compliant_arm_that_is_pushed_beyond_the_margin_is_held(newtons: float, least: float, end: str) -> None:
+    with over_the_table() as (rig, step):
+        seen, trip = [], ""
+        with rig.robots["panda"].control(rate_hz=50, controller=hal.OperationalSpace()) as control:
+            for k in range(120):
+                if k == 80 and newtons:
+                    rig.world.apply_force("panda", [0.0, 0.0, -newtons], link="panda_hand", duration=0.5)
+                try:
+                    control.send(hal.Twist([0.0, 0.0, -0.25 if k < 80 else 0.0]))
+                except hal.MotionStopped as stop:
+                    trip = stop.code
+                seen += [step()[0] for _ in range(4)]
+    assert least <= min(seen) <= 11e-3
+    assert trip == end
 
 
 @pytest.mark.parametrize(("model", "count"), [("so101", 4), ("piper", 2)])
 def test_an_arm_inside_a_margin_comes_home_or_is_refused_at_once(model: str, count: int) -> None:
-    found = BENCHMARK["starts"](model, count)
+    found = collisions.starts(model, count)
     assert found["came home"] + found["refused at once"] == count
     assert found["came home"] >= count // 2
 

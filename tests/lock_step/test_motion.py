@@ -1,20 +1,18 @@
-"""Small counts of ``benchmarks/motion.py``: lines in both worlds, refusals, and speeds."""
-
-import runpy
-from pathlib import Path
+"""Whole motions: lines in both worlds (small counts of ``benchmarks/motion.py``), refusals, and speeds."""
 
 import numpy as np
 import pytest
+from benchmark_kit import load_benchmark
 
 import hal
 
-BENCHMARK = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "motion.py"))
+lines = load_benchmark("motion")
 
 
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
 def test_the_simulated_arm_stays_on_its_line(engine: str) -> None:
     pytest.importorskip(engine)
-    found = BENCHMARK["lines"](2, engine)
+    found = lines.lines(2, engine)
     assert found["off_set"] <= 5e-4
     assert found["off"] <= 2e-3
     assert found["tilt"] <= 5e-3
@@ -23,7 +21,7 @@ def test_the_simulated_arm_stays_on_its_line(engine: str) -> None:
 
 @pytest.mark.parametrize("controller", [hal.OperationalSpace(), hal.JointImpedance()], ids=["tcp", "joints"])
 def test_a_compliant_arm_stays_on_its_line(controller: hal.OperationalSpace | hal.JointImpedance) -> None:
-    found = BENCHMARK["lines"](1, controller=controller)
+    found = lines.lines(1, controller=controller)
     assert found["off_set"] <= 5e-4
     assert found["off"] <= 2e-3
     assert found["tilt"] <= 5e-3
@@ -53,7 +51,7 @@ def test_a_compliant_arm_waits_at_an_obstacle_until_it_is_gone() -> None:
 
 
 def test_lines_that_are_begun_end_and_those_refused_are_impossible() -> None:
-    found = BENCHMARK["checks"](6)
+    found = lines.checks(6)
     assert found["began"]
     assert found["refused"]
     assert (found["stopped_underway"], found["off"], found["confirmed"]) == (0, 0, 1.0)
@@ -61,10 +59,32 @@ def test_lines_that_are_begun_end_and_those_refused_are_impossible() -> None:
 
 
 def test_poses_out_of_reach_are_refused_before_anything_moves() -> None:
-    assert BENCHMARK["refusals"](4)["moved"] == 0
+    numbers = np.random.default_rng(1)
+    with hal.open("panda_table", driver="mock") as rig:
+        arm = rig.robots["panda"]
+        for _ in range(4):
+            way, turn = numbers.normal(size=3), numbers.normal(size=4)
+            place = way / np.linalg.norm(way) * numbers.uniform(0.95, 2.0) + [0.0, 0.0, 0.333]
+            for straight in (False, True):
+                with pytest.raises(hal.Unreachable):
+                    arm.move_to(hal.Pose(place, turn), straight=straight)
+        assert len(rig.driver("panda").log) == 0
 
 
 def test_move_to_keeps_its_share_of_the_speed() -> None:
-    found = BENCHMARK["speeds"]()
-    assert found["ratio"] == pytest.approx(10.0, rel=0.01)
-    assert 0.2 < found["tcp_at_1.0"] <= 0.25
+    peaks = {}
+    with hal.open("panda_table", driver="mock", overrides=["robots.panda.tcp_speed=3.0"]) as rig:
+        arm = rig.robots["panda"]
+        goal = arm.home + np.array([0.5, 0.15, -0.2, 0.25, 0.15, -0.25, 0.4])
+        log = rig.driver("panda").log
+        for speed, tcp_speed in ((0.02, None), (0.2, None), (1.0, 0.25)):
+            log.clear()
+            arm.move_to(goal, speed=speed, tcp_speed=tcp_speed)
+            q = np.array([setpoint.q for setpoint in log])
+            dt = 1.0 / rig._local.spec.rate_hz
+            tcp = np.array([arm.kinematics.fk(x)[:3] for x in q])
+            peaks[speed] = float((np.abs(np.diff(q, axis=0)).max(axis=0) / dt / np.array(arm.limits.velocity)).max())
+            fastest = float(np.linalg.norm(np.diff(tcp, axis=0), axis=1).max() / dt)
+            arm.move_to(arm.home, speed=0.5)
+    assert peaks[0.2] / peaks[0.02] == pytest.approx(10.0, rel=0.01)
+    assert 0.2 < fastest <= 0.25

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
+from benchmark_kit import load_benchmark
 from engines_kit import Engine
 
 from hal.config.data_files import list_data
 from hal.errors import ConfigError
 from hal.types import Trip
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import robots  # type: ignore[import-not-found]  # benchmarks/robots.py
-
+robots = load_benchmark("robots")
 pytestmark = pytest.mark.slow
 ENTRIES = [entry for model in list_data("robots") for entry in robots.entries(model)]
 
@@ -23,7 +20,7 @@ ENTRIES = [entry for model in list_data("robots") for entry in robots.entries(mo
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: "-".join(entry.values()))
 def test_a_model_drives_and_closes_its_gripper(engine: Engine, entry: dict[str, Any]) -> None:
     try:
-        found = robots.run(entry, engine.name, poses=10, tour=0.1)
+        found = robots.run_model(entry, engine.name, poses=10, tour=0.1)
     except ConfigError as error:
         if all(problem.code == "missing_package" for problem in error.problems):
             pytest.skip(error.problems[0].message)

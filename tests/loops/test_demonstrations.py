@@ -1,7 +1,8 @@
 """From a demonstration to a policy and back: what is generated or recorded lifts the cube again.
 
 Demonstrations and policies go through the command line, in lock-step, with few episodes on one engine each;
-``HAL_SOAK=1`` runs 20 of each on both.
+``HAL_SOAK=1`` runs 20 of each on both, and policies on two sets of 20 unseen seeds. ``HAL_TEST_LEROBOT``, the
+interpreter of LeRobot's environment, adds its reader.
 """
 
 from __future__ import annotations
@@ -9,11 +10,14 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from demonstrations import is_lifted
+from app_kit import write_pad
+from demonstrations import ServedRegression, is_lifted
 
 import hal
 from hal.apps import collect, generate, rollout
@@ -23,6 +27,7 @@ from hal.learning.replay import RecordedTrajectory, TrajectoryPlayer
 from hal.recording import Dataset, Episode
 
 SOAK = os.environ.get("HAL_SOAK") == "1"
+pytestmark = pytest.mark.timeout(1200 if SOAK else 120)
 ENGINES = pytest.mark.parametrize("engine", ["pybullet", "mujoco"] if SOAK else ["mujoco"])
 _PAIRS = list(
     itertools.product(
@@ -32,6 +37,7 @@ _PAIRS = list(
 )
 SKILLS = pytest.mark.parametrize(("skill", "engine"), _PAIRS if SOAK else _PAIRS[::3])
 """All skills on both engines; without a soak some of both."""
+PROGRAM = Path(__file__).parents[1] / "kits" / "lerobot_program.py"
 BARE = ["--sim", "--set", "cameras={}"]
 
 
@@ -76,18 +82,67 @@ def test_what_a_person_recorded_is_replayed(tmp_path: Path, engine: str) -> None
 
 
 @ENGINES
-def test_a_regression_of_the_demonstrations_lifts_the_cube(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str
-) -> None:
+def test_an_episode_with_a_takeover_is_replayed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str) -> None:
     monkeypatch.syspath_prepend(Path(__file__).parents[2])
-    monkeypatch.setenv("DEMONSTRATIONS", str(tmp_path / "out"))
-    generated(tmp_path / "out", "examples.pick:pick", engine, 60)
-    episodes = 20 if SOAK else 2
-    unseen = ["--seed", "1000", "--episodes", str(episodes), "--report", str(tmp_path / "report.json")]
-    judged = ["--policy", "demonstrations:Regression", "--success", f"demonstrations:{is_lifted.__name__}"]
-    rollout.main([*judged, *BARE, "--set", "simulation.clock=lock_step", "--engine", engine, "--seconds", "7", *unseen])
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert sum(one["success"] is True for one in report["episodes"]) >= 0.9 * episodes
+    pad = write_pad(tmp_path, (2.0, "BTN_TL"), (4.0, "BTN_TL"), until=25.0, held=(0.5, 24.0))
+    policy = ["--policy", "demonstrations:Picker", "--success", f"demonstrations:{is_lifted.__name__}"]
+    options = [*policy, *BARE, "--set", "simulation.clock=lock_step", "--engine", engine, "--seconds", "20"]
+    seeds = range(500, 520 if SOAK else 501)
+    for seed in seeds:
+        rollout.main([*options, "--takeover", "--pad", pad, "--seed", str(seed), "--out", str(tmp_path / "out")])
+    found = [one for one in Dataset(tmp_path / "out").episodes if one.success]
+    assert len(found) >= 0.95 * len(seeds)
+    assert all(one.columns["intervention"].any() for one in found)
+    assert sum(replayed(one, engine) for one in found) >= 0.95 * len(found)
+
+
+@pytest.fixture(scope="module", params=["pybullet", "mujoco"] if SOAK else ["mujoco"])
+def picks(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """An engine, and demonstrations there."""
+    out = tmp_path_factory.mktemp("picks") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[2])
+        generated(out, "examples.pick:pick", request.param, 60 if SOAK else 20)
+        yield request.param, out
+
+
+def rolled_out(folder: Path, engine: str, *policy: str) -> None:
+    """Roll a policy out on seeds that nothing was chosen with; at least 18 of 20 episodes are successes."""
+    count = 20 if SOAK else 1
+    for seed in (2000, 3000) if SOAK else (2000,):
+        unseen = ["--seed", str(seed), "--episodes", str(count), "--report", str(folder / "report.json")]
+        options = [*BARE, "--set", "simulation.clock=lock_step", "--engine", engine, "--seconds", "7", *unseen]
+        rollout.main([*policy, "--success", f"demonstrations:{is_lifted.__name__}", *options])
+        report = json.loads((folder / "report.json").read_text())
+        lifted = sum(one["success"] is True for one in report["episodes"])
+        print(f"RESULT {policy[1]} {engine} seeds {seed} on: {lifted} of {count}")
+        assert lifted >= 0.9 * count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", ["hal", *(["lerobot"] if "HAL_TEST_LEROBOT" in os.environ else [])])
+def test_a_regression_of_the_demonstrations_lifts_the_cube(
+    picks: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str
+) -> None:
+    engine, place = picks
+    if reader == "lerobot":  # an environment of its own, as for tests/system/test_lerobot_tools.py
+        job, place = ["read", str(place), str(tmp_path / "items.npz")], tmp_path / "items.npz"
+        command = [os.environ["HAL_TEST_LEROBOT"], str(PROGRAM), json.dumps([job])]
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+        offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "cache")}
+        subprocess.run(command, env=environment | offline, check=True, timeout=500)
+    monkeypatch.setenv("DEMONSTRATIONS", str(place))
+    rolled_out(tmp_path, engine, "--policy", "demonstrations:Regression")
+
+
+@pytest.mark.slow
+def test_a_served_regression_of_the_demonstrations_lifts_the_cube(picks: tuple[str, Path], tmp_path: Path) -> None:
+    engine, place = picks
+    robot = Dataset(place).episodes[0].info["rig"]["resolved"]["robots"][0]
+    policy = ServedRegression(place, hal.Pose(robot["base_position"], robot["base_orientation"]))
+    (tmp_path / "steps.yaml").write_text(json.dumps(policy.CONFIG))
+    with PolicyServer(policy.infer, reset=policy.reset, port=0) as server:
+        rolled_out(tmp_path, engine, "--policy", server.url, "--policy-config", str(tmp_path / "steps.yaml"))
 
 
 class Recall:

@@ -72,6 +72,22 @@ def test_nothing_but_hal_is_on_the_path(environment: Path, tmp_path: Path) -> No
     assert Path(robots) == ROOT.resolve() / "robots"
 
 
+def test_a_checkout_without_links_says_what_to_do(environment: Path, tmp_path: Path) -> None:
+    """As git makes it where there are no symbolic links: each is a text file with the path that it leads to."""
+    package = tmp_path / "hal"
+    package.mkdir()
+    (package / "__init__.py").write_bytes((ROOT / "hal" / "__init__.py").read_bytes())
+    for name in ("apps", "drivers"):
+        (package / name).write_text(f"../{name}")
+    done = subprocess.run(
+        [environment, "-c", "import hal.apps"], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1
+    line = done.stderr.splitlines()[-1]
+    assert line.startswith("ImportError: ")
+    assert "git config core.symlinks true && git restore hal src" in line
+
+
 def _run(command: list[object], folder: Path, status: int = 0) -> str:
     """Return the standard output of a command, which ends with ``status``."""
     texts = [str(part) for part in command]

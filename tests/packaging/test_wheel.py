@@ -95,16 +95,16 @@ def test_a_users_own_drivers_folder_does_not_shadow_ours_even_first_on_the_path(
 
 
 def test_the_console_script_works_from_there(installed: Path, hostile: Path) -> None:
-    script = installed / "bin" / "hal teleop"
-    output = _run([sys.executable, str(script), "--help"], hostile, PYTHONPATH=str(installed))
+    script = installed / "bin" / "hal"
+    output = _run([sys.executable, str(script), "teleop", "--help"], hostile, PYTHONPATH=str(installed))
     assert "--sim" in output
     assert "--pad" in output
 
 
 def test_the_data_is_found_from_there(installed: Path, hostile: Path) -> None:
     """The built-in rig, validated by its name, is the installed one and not the user's file of the same path."""
-    script = installed / "bin" / "hal teleop"
-    command = [sys.executable, str(script), "--sim", "--config", "panda_table", "--dry-run"]
+    script = installed / "bin" / "hal"
+    command = [sys.executable, str(script), "teleop", "--sim", "--config", "panda_table", "--dry-run"]
     output = _run(command, hostile, PYTHONPATH=str(installed))
     assert "panda" in output
 

@@ -10,7 +10,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -132,3 +134,58 @@ def test_a_ray_cluster_makes_the_same_rows(tmp_path: Path, expected: Path) -> No
     )
     assert done.returncode == 0, done.stderr
     check_same(out, expected)
+
+
+WATCHED = """
+import os, tempfile
+from pathlib import Path
+from pick import pick as picked
+
+
+def pick(rig, random):
+    node = Path(tempfile.gettempdir())
+    with open(os.environ["WATCH"], "a") as file:
+        file.write(f"{node.name} {os.environ['CUDA_VISIBLE_DEVICES']} {len(list(node.iterdir()))} {__file__}\\n")
+    return picked(rig, random)
+"""
+
+
+@pytest.fixture
+def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The address of a cluster of two nodes, each with a processor, two graphics cards, and a temporary folder."""
+    pytest.importorskip("ray", reason="pip install 'robot-hal[ray]'")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # the loopback address stays what it is
+    from ray.cluster_utils import Cluster
+
+    own = {"node_ip_address": "127.0.0.1", "include_dashboard": False, "object_store_memory": 80_000_000}
+    with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as ray:
+        cluster = Cluster(True, head_node_args={**own, "num_cpus": 0, "temp_dir": ray})
+        try:
+            for name in ("node_0", "node_1"):
+                (tmp_path / name).mkdir()
+                cluster.add_node(num_cpus=1, num_gpus=2, env_vars={"TMPDIR": str(tmp_path / name)}, **own)
+            yield cluster.address
+        finally:
+            cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_nodes_without_a_shared_folder_upload_what_they_make(nodes: str, tmp_path: Path, expected: Path) -> None:
+    pytest.importorskip("fsspec", reason="pip install 'robot-hal[ray]'")
+    watch, program, out = tmp_path / "watch.txt", tmp_path / "program", tmp_path / "result" / "out"
+    program.mkdir(), out.parent.mkdir()
+    (program / "pick.py").write_bytes((ROOT / "examples" / "pick.py").read_bytes())
+    (program / "watched.py").write_text(WATCHED)
+    (program / "environment.yaml").write_text(f"working_dir: .\nenv_vars: {{WATCH: {watch}}}\n")
+    options = ["--workers", "3", "--ray", nodes, "--gpus", "0.5", "--runtime-env", "environment.yaml"]
+    run = command(out, *options, "--upload", (tmp_path / "bucket").as_uri(), "--skill", "watched:pick")
+    done = subprocess.run(run, cwd=program, capture_output=True, text=True, timeout=200.0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = [line.split() for line in watch.read_text().splitlines()]
+    assert {place for place, *_ in found} == {"node_0", "node_1"}
+    assert {cards for _, cards, *_ in found} <= {"0", "1"}
+    assert {files for _, _, files, _ in found} == {"1"}, "the temporary folder of the one worker that has room there"
+    assert not any(Path(module).is_relative_to(program) for *_, module in found), "each node has a copy"
+    check_same(out, expected)
+    assert not any(path.is_file() for name in ("node_0", "node_1", "bucket") for path in (tmp_path / name).rglob("*"))

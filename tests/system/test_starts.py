@@ -118,3 +118,51 @@ def test_the_servo_runs_the_copy_of_the_library_that_the_app_runs(tmp_path: Path
     assert done.stdout.startswith(told), done.stdout + done.stderr
     if change != "none":
         assert str(copy) in done.stdout
+
+
+LAB_ARM = """
+import os
+from hal.drivers.mock.robot import MockRobot
+
+WHERE, END = {where!r}, {end!r}
+
+def end(where):
+    if where == WHERE:
+        print("the last line of the lab's driver")
+        exec(END)
+
+class Arm(MockRobot):
+    def open(self):
+        super().open()
+        end("open")
+
+end("import")
+"""
+LAB_DRIVER = """
+from hal.registry import DriverSpec
+DRIVER = DriverSpec(name="lab", robot="lab_arm:Arm")
+"""
+
+
+@pytest.mark.parametrize(
+    ("where", "end", "says"),
+    [
+        ("import", "os.kill(os.getpid(), 2)", "SIGINT"),
+        ("open", "os.kill(os.getpid(), 2)", "SIGINT"),
+        ("open", "os.kill(os.getpid(), 15)", "SIGTERM"),
+        ("open", "os.kill(os.getpid(), 9)", "SIGKILL"),
+        ("open", "os._exit(3)", "status 3"),
+    ],
+)
+def test_a_host_that_ends_while_it_starts_has_a_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, end: str, says: str
+) -> None:
+    (tmp_path / "lab_arm.py").write_text(LAB_ARM.format(where=where, end=end))
+    (tmp_path / "lab_driver.py").write_text(LAB_DRIVER)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "lab_driver", raising=False)
+    arm = {"model": "panda", "drivers": {"real": "lab_driver:DRIVER"}, "gripper": {"enabled": False}}
+    with pytest.raises(hal.ConnectionLost, match=rf"process ended while it started \({says}") as caught:
+        hal.open({"sim": False, "robots": {"arm": arm}}).close()
+    assert caught.value.code == "process_ended"
+    assert "the last line of the lab's driver" in str(caught.value)

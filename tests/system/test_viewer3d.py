@@ -109,7 +109,12 @@ def test_access_needs_the_link(viewer: ViserViewer) -> None:
     assert status == 200
     assert get(bare, Cookie=cookie)[0] == 200  # a page that is loaded again
     ours = f"http://{parts.netloc}"
-    for origin, crumbs in ((ours, {}), ("http://evil.example", {"Cookie": cookie}), (ours, {"Cookie": "a=b; c"})):
+    for origin, crumbs in (
+        (ours, {}),
+        ("http://evil.example", {"Cookie": cookie}),
+        (None, {"Cookie": cookie}),
+        (ours, {"Cookie": "a=b; c"}),
+    ):
         with pytest.raises(InvalidStatus, match="403"):
             connect(
                 f"ws://{parts.netloc}",

@@ -2,9 +2,15 @@
 
 import importlib
 import re
+import runpy
+from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import pytest
+from app_kit import run_here
+
+from hal.apps.main import BESIDE, PROGRAMS, main
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -31,3 +37,51 @@ def test_the_files_that_a_document_names_are_there(document: Path) -> None:
         assert (ROOT / path).is_file(), path
     for path, test in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
         assert f"def {test}(" in (ROOT / path).read_text(), f"{path} has no {test}"
+
+
+FOLDERS = ("apps", "config", "drivers", "examples", "hal", "sensors")
+SOURCES = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.*") if path.suffix in (".py", ".yaml")]
+COMMAND = re.compile(
+    r"""(?:^[ #$]*|(?<!name=)(?<!name=f)[`"'(:,;] ?|\b(?:or|run|with|see|and) )"""
+    r"""(hal|python -m [\w.]+) ([^`"'\n;|>#)]*)""",
+    re.MULTILINE,
+)
+"""A command in a page, a help text or a message, and its words; threads (``name="hal pad"``) are none."""
+SUBCOMMANDS = ("dataset", "calibrate")
+
+
+@cache
+def help_text(*words: str) -> str:
+    """Return what a command shows with ``--help``."""
+    if words[0] == "hal":
+        done = run_here(main, *words[1:], "--help")
+    else:
+        with mock.patch("sys.argv", [words[0], "--help"]):
+            done = run_here(lambda _: bool(runpy.run_module(words[0], run_name="__main__")))
+    assert done.returncode == 0, f"{words}: {done.stderr}"
+    return done.stdout
+
+
+@pytest.mark.parametrize("paths", [DOCUMENTS, SOURCES], ids=["documents", "sources"])
+def test_commands_that_are_named_exist_and_have_the_options_beside_them(paths: list[Path]) -> None:
+    checked = 0
+    for path in paths:
+        text = re.sub(r"\\\n\s*", "", path.read_text(encoding="utf-8"))
+        for command, rest in COMMAND.findall(text):
+            words = [word.rstrip(".,") for word in re.match(r"(?:[a-z][a-z-]*[.,]?(?: |$)){0,2}", rest)[0].split()]
+            where = f"{path.name}: {command} {rest}"
+            if command == "hal":
+                if not words or words[0] in BESIDE:  # alone, or in a package that need not be installed
+                    continue
+                assert words[0] in (*PROGRAMS, "list", "schema"), where
+                known = help_text("hal", words[0])
+                if words[0] in SUBCOMMANDS and len(words) > 1:
+                    known += help_text("hal", *words)
+            elif command.startswith("python -m hal."):
+                known = help_text(command.removeprefix("python -m "))
+            else:
+                continue
+            checked += 1
+            for option in re.findall(r"(?<!\S)--[a-z][a-z-]*", rest):
+                assert option in known, f"{where}: there is no {option}"
+    assert checked > 30

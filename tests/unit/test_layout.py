@@ -102,14 +102,14 @@ def test_import_circles_are_few_and_small() -> None:
 
 
 def test_hal_names_no_driver() -> None:
-    """Only the registry does, and what ships for tests. Ark's configurations use such names themselves."""
+    """Only the registry does, and what ships for tests."""
     quoted = re.compile(rf"""["']({"|".join(DRIVERS)})["']""")
     texts = re.compile(r'"""(?:.|\n)*?"""')  # docstrings show how a driver is chosen
     libraries = {"hal.recording.metadata"}  # names the Python packages whose versions an episode keeps
     wrong = {
         f"{module}: {found[0]}"
         for module, path in sources().items()
-        if not module.startswith(("hal.drivers", "hal.apps", "hal.ark", "hal.testing"))
+        if not module.startswith(("hal.drivers", "hal.apps", "hal.testing"))
         and module not in {"hal.registry", *libraries}
         for found in quoted.finditer(texts.sub("", path.read_text(encoding="utf-8")))
     }
@@ -137,6 +137,21 @@ def test_a_driver_imports_no_other_driver_and_no_app() -> None:
         if name.startswith("hal.apps.")
         or (name.startswith("hal.drivers.") and name.split(".")[2] not in (module.split(".")[2], SHARED))
     }
+    assert not wrong
+
+
+def test_hal_imports_no_package_beside_it_and_these_use_its_public_names() -> None:
+    """Packages in ``packages/`` are found by their entry points, and their imports of ``hal`` have no underscore."""
+    beside = {path.parent.name: path.parent for path in (ROOT / "packages").glob("*/src/*/__init__.py")}
+    assert beside
+    assert not [f"{module} imports {name}" for module in sources() for name in imports(module) if name in beside]
+    wrong = []
+    for folder in beside.values():
+        for path in folder.rglob("*.py"):
+            for node in ast.walk(tree(path)):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "hal":
+                    names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+                    wrong += [f"{path}: {name}" for name in names if name.startswith("_")]
     assert not wrong
 
 

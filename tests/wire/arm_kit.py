@@ -21,7 +21,7 @@ ZERO = (0.0,) * 7
 class Bench:
     """An arm and its client."""
 
-    def __init__(self, version: int = 10, plant: Plant | None = None, library: bytes | None = None) -> None:
+    def __init__(self, version: int = 10, plant: Plant | None = None, library: bytes = b"") -> None:
         self.version = version
         self.journal = Journal(quiet=True)
         self.replies: list[ArmReply] = []

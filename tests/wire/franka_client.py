@@ -173,9 +173,29 @@ def read(host: str) -> Report:
         "seconds": state.time.to_sec(),
         "next": robot.read_once().time.to_sec(),
     }
-    if IS_FR3:
-        return {**report, "gravity": list(robot.load_model().gravity(state))}
-    return {**report, "version": robot.server_version(), "model": attempt(robot.load_model)}
+    if not IS_FR3:
+        report["version"] = robot.server_version()
+    return {**report, "gravity": list(robot.load_model().gravity(state))}
+
+
+def panda_py_panda(host: str) -> Report:
+    """Use the class that examples of panda_py begin with: its model, and a motion with a controller that needs it."""
+    panda_py, controllers = importlib.import_module("panda_py"), importlib.import_module("panda_py.controllers")
+    panda = panda_py.Panda(host)
+    state, model = panda.get_state(), panda.get_model()
+    report: Report = {"O_T_EE": list(state.O_T_EE), "pose": list(model.pose(franka.Frame.kEndEffector, state))}
+    report["moved"] = panda.move_to_joint_position(panda.q + 0.1)
+    report["q"] = panda.q.tolist()
+    start = panda.get_position()
+    controller = controllers.CartesianImpedance(filter_coeff=1.0)
+    panda.start_controller(controller)
+    controller.set_control(start + [0.0, 0.05, 0.0], panda.get_orientation())
+    for _ in range(2000):
+        if abs(panda.get_position() - start)[1] > 0.045:
+            break
+        time.sleep(0.005)
+    panda.stop_controller()
+    return {**report, "way": (panda.get_position() - start).tolist()}
 
 
 def motion(host: str, times: int = 1, commands: list[str] | None = None, **arguments: Any) -> Report:

@@ -1,6 +1,6 @@
 """Emulated CAN arms under gravity: at rest, on a recorded drive, and after the end of their program.
 
-Short versions of ``benchmarks/can_arm.py``; ``docs/measured.md`` has the long ones.
+Short versions of ``python -m benchmarks can``; ``docs/measured.md`` has the long ones.
 """
 
 from __future__ import annotations

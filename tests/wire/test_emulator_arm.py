@@ -168,6 +168,7 @@ def test_what_a_panda_has_besides() -> None:
     assert bench.replies[-1].body == bytes(154)
     bench.requests.handle("LoadModelLibrary", 2, bytes(2))
     assert bench.replies[-1].body == b"\0\x7fELF"
+    assert bench.ask("LoadModelLibrary", b"\2\0") != 0, "the client runs on another processor"
     assert bench.ask("SetFilters", struct.pack("<5d", *[100.0] * 5)) == 0
     # Its torque control asks for velocities as well, which stay 0.
     assert bench.move(Generator.JOINT_VELOCITY, external=True) == 1

@@ -42,12 +42,21 @@ def test_connecting_and_reading(client, robot):
     assert report["F_T_EE"][14] == pytest.approx(0.1034)
     if robot == "panda":
         assert (report["version"], report["m_ee"]) == (5, 0.73)
-        assert report["model"] != "", "there is no model library to send"
     else:
         assert report["elbow"] == [0.0, -1.0]
-        # The library makes its model of the URDF that came over the wire: it has the weight that the joints show.
-        assert report["gravity"] == pytest.approx(report["tau"], abs=0.15)
-        assert abs(report["gravity"][3]) > 15.0
+    # The library makes its model of what came over the wire: it has the weight that the joints show.
+    assert report["gravity"] == pytest.approx(report["tau"], abs=0.15)
+    assert abs(report["gravity"][3]) > 15.0
+
+
+@pytest.mark.parametrize("robot", ["panda"])
+def test_panda_py_opens_its_panda_and_moves_it_by_its_model(client, emulator):
+    report = client("panda_py_panda")
+    assert report["pose"] == pytest.approx(report["O_T_EE"], abs=1e-9)
+    assert report["moved"] is True
+    assert report["q"] == pytest.approx(np.array(HOME) + 0.1, abs=2e-3)
+    assert report["way"] == pytest.approx([0.0, 0.05, 0.0], abs=0.01)
+    assert [event["outcome"] for event in emulator.events("motion ended")[-2:]] == ["success", "success"]
 
 
 @both

@@ -19,9 +19,10 @@ from waiting import wait_until
 
 import hal
 from hal.drivers.franka.arm import create_link
+from hal.types import RobotStatus
 
 from .franka_kit import Client, Emulator, free_host
-from .rig_kit import arm_of, rig_of
+from .rig_kit import Drive, arm_of, rig_of
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
@@ -226,6 +227,59 @@ def test_an_arm_is_ready_while_another_thread_works(emulator: Emulator) -> None:
             thread.join()
     assert not emulator.events("reflex")
     assert "success" in emulator.events("motion ended")[-1]["text"]
+
+
+# A robot that ends a motion, and does not answer the library, which then waits for ever.
+
+
+def test_a_mode_change_without_an_answer_ends_the_motion_and_not_the_process(emulator: Emulator) -> None:
+    with rig_of(emulator.host, model_of(emulator)) as rig:
+        arm, host = arm_of(rig), rig._hosts[0].child.process.pid
+        struck: list[float] = []
+
+        def strike() -> bool:
+            if not struck and abs(arm.state(5.0).tcp_twist[1]) > 0.03:
+                emulator.control.send("no-move-reply on")
+                emulator.control.send("reflex joint_reflex")
+                struck.append(time.monotonic())
+            return False
+
+        drive = Drive(arm)
+        drive.go(rig, 10.0, strike)
+        assert isinstance(drive.error, hal.MotionStopped)
+        assert drive.error.code == "device_lost"
+        assert drive.t_error - struck[0] < 3.0
+        with pytest.raises(hal.ConnectionLost) as lost:
+            arm.state(5.0)
+        assert lost.value.code == "unanswered"
+        # The robot is found again, and tells why it ended the motion.
+        wait_until(lambda: status_of(arm) is RobotStatus.FAULT, "connected again")
+        assert arm.state().fault.code == "joint_reflex"
+        emulator.control.send("no-move-reply off")
+        arm.recover()
+        again = Drive(arm)
+        again.go(rig, 0.5)
+        assert again.error is None
+        assert "success" in emulator.events("motion ended")[-1]["text"]
+        assert rig._hosts[0].child.process.pid == host
+        assert runs(host)
+
+
+def test_an_end_without_an_answer_costs_the_connection_and_not_the_process(emulator: Emulator) -> None:
+    with rig_of(emulator.host, model_of(emulator)) as rig:
+        arm = arm_of(rig)
+        Drive(arm).go(rig, 0.3, lambda: bool(emulator.control.send("no-move-reply on")) and False)
+        wait_until(lambda: status_of(arm) is None, "lost")
+        wait_until(lambda: status_of(arm) is RobotStatus.IDLE, "connected again")
+        assert runs(rig._hosts[0].child.process.pid)
+
+
+def status_of(arm: hal.Robot) -> RobotStatus | None:
+    """Return its status; None while the robot does not answer."""
+    try:
+        return arm.state().status
+    except (hal.ConnectionLost, hal.StaleStateError):
+        return None
 
 
 # An app that is gone leaves no process behind, though the robot hangs: the libraries then wait for ever.

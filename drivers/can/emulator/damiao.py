@@ -239,7 +239,8 @@ class EmulatedDamiaoArm:
             }
             for motor in self.motors.values()
         }
-        return {"motors": motors}
+        fingers = {} if self.gripper is None else {"gripper": {"q": self.gripper.q, "tau": self.gripper.tau}}
+        return {"motors": motors, **fingers}
 
     # Faults.
 

@@ -19,6 +19,7 @@ from .console import CommandConsole, Executor
 from .control import CONTROL_PORT
 from .faults import help_text
 from .journal import Journal
+from .model_library import write_model_library
 from .plant import IdealPlant, LaggingPlant, Plant, PyBulletPlant, RigidBody, arm_only
 from .protocol import PORT, PROTOCOLS
 from .server import ArmServer, Pacing
@@ -57,10 +58,8 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
     """Return the server, ready to run, and the line that announces it. Raises OSError and ValueError."""
     title, model, version = _ROBOTS[options.robot]
     urdf = options.urdf or find_data("robots", f"{options.robot}.urdf")
-    library = options.model_library
-    files = RobotFiles(
-        arm_only(urdf.read_text(encoding="utf-8")).encode(), library.read_bytes() if library is not None else None
-    )
+    bare = arm_only(urdf.read_text(encoding="utf-8"))
+    files = RobotFiles(bare.encode(), write_model_library(bare) if version == 5 else b"")
     plant = _plant(options, urdf)
     stack.callback(plant.close)
     with_hand = options.end_effector == "hand"
@@ -114,12 +113,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--q", type=float, nargs=7, default=_HOME, metavar="RAD", help="joint positions at the start (home)")
     add("--urdf", type=Path, help="the arm's URDF (the project's own)")
-    add(
-        "--model-library",
-        type=Path,
-        metavar="FILE",
-        help="panda: shared object for clients that request the model (none)",
-    )
     add("--end-effector", choices=("hand", "none"), default="hand", help="tool on the flange (%(default)s)")
     add("--no-hand", action="store_true", help="serve the arm only")
     add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")

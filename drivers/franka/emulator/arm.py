@@ -415,6 +415,8 @@ def _elbow(q: Floats) -> tuple[float, float]:
 
 _VIRTUAL_WALL = bytes(24 + 128 + 1)
 """Payload of GetCartesianLimit: size, frame, whether it is active. There is no virtual wall."""
+_X64_LINUX = bytes(2)
+"""Payload of a LoadModelLibrary that can be answered: architecture and system."""
 
 
 @dataclass(frozen=True)
@@ -422,8 +424,8 @@ class RobotFiles:
     """Files that a client may request."""
 
     urdf: bytes
-    model_library: bytes | None = None
-    """Shared object for a Panda's client; none is included."""
+    model_library: bytes
+    """Shared object for a Panda's client (:mod:`.model_library`)."""
 
 
 class RequestHandler:
@@ -488,9 +490,10 @@ class RequestHandler:
         self._arm.answer("GetRobotModel", number, RequestOutcome.SUCCESS, self._files.urdf)
 
     def _library(self, number: int, payload: bytes) -> None:
-        library = self._files.model_library
-        outcome = RequestOutcome.NOT_POSSIBLE if library is None else RequestOutcome.SUCCESS
-        self._arm.answer("LoadModelLibrary", number, outcome, library or b"")
+        if payload == _X64_LINUX:
+            self._arm.answer("LoadModelLibrary", number, RequestOutcome.SUCCESS, self._files.model_library)
+        else:
+            self._arm.answer("LoadModelLibrary", number, RequestOutcome.NOT_POSSIBLE)
 
     def _wall(self, number: int, payload: bytes) -> None:
         self._arm.answer("GetCartesianLimit", number, RequestOutcome.SUCCESS, _VIRTUAL_WALL)

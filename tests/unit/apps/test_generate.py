@@ -35,6 +35,10 @@ SKILL = ("--skill", "skills:wait", "--out", "out")
         (["--out", "out"], "--policy --skill"),
         (["--skill", "skills:jump", "--out", "out"], "jump"),
         ([*SKILL, "--sim", "--workers", "0"], "--workers"),
+        ([*SKILL, "--sim", "--upload", "folder"], "--upload folder"),
+        ([*SKILL, "--sim", "--gpus", "1"], "--ray"),
+        ([*SKILL, "--sim", "--ray", "auto", "--gpus", "nan"], "--gpus"),
+        ([*SKILL, "--sim", "--ray", "auto", "--runtime-env", "none.yaml"], "none.yaml"),
         ([*SKILL, "--sim", "--cameras", "wirst"], "did you mean 'wrist'"),
         ([*SKILL, "--config", "franka_emulator"], "--sim"),
         ([*SKILL, "--real", "--set", "cameras={}", "--set", "robots.panda.real.host=172.16.0.2"], "leave out --real"),
@@ -66,6 +70,13 @@ def test_an_engine_that_is_not_installed_leaves_no_folder(folder: Path, monkeypa
 
 def test_the_progress_has_the_rate_and_the_time_left() -> None:
     assert describe(GenerateProgress(3, 200, 0, 0, 0.0, None, 0)) == "3 of 200 episodes"
-    text = describe(GenerateProgress(50, 200, 30, 40, 1.25, 3725.0, 2))
-    for part in ("50 of 200", "1.25/s", "1:02:05 left", "30 succeeded (75 % of 40)", "2 worker(s) replaced"):
+    text = describe(GenerateProgress(50, 200, 30, 40, 1.25, 3725.0, 2, 14))
+    for part in (
+        "50 of 200",
+        "1.25/s",
+        "1:02:05 left",
+        "30 succeeded (75 % of 40)",
+        "2 worker(s) replaced",
+        "14 worker(s) waiting",
+    ):
         assert part in text

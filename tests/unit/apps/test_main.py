@@ -10,62 +10,27 @@ import pytest
 from app_kit import run_here
 from engines_kit import AUTO
 
-from hal.apps import dataset, teleop
-from hal.apps.main import PROGRAMS, main
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # comes with pytest where the standard library has none
+from hal.apps import dataset
+from hal.apps.main import BESIDE, PROGRAMS, main
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_it_has_every_program_that_is_installed() -> None:
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert {name.removeprefix("hal-") for name in scripts} == {*PROGRAMS, "hal"}
+def test_it_has_every_program() -> None:
+    files = {path.stem.replace("_", "-") for path in (ROOT / "apps").glob("[a-z]*.py")}
+    assert files == {*PROGRAMS, "main"}
     done = run_here(main)
     assert done.returncode == 0
     assert [name for name in PROGRAMS if name not in done.stdout] == []
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_a_program_gets_its_own_options(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as done:
-        main([name, "--help"])
-    assert done.value.code == 0
-    assert "usage:" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("command", "words", "usage"),
-    [
-        ("/usr/bin/hal", ["collect"], "hal collect"),
-        ("/usr/bin/hal", ["import-ark"], "hal import-ark"),
-        ("/usr/bin/hal", ["calibrate", "board"], "hal calibrate board"),
-        ("/usr/bin/hal", ["dataset", "split"], "hal dataset split"),
-        ("/usr/bin/hal", [], "hal"),
-        ("apps/main.py", ["review"], "main.py review"),
-        ("apps/main.py", ["list"], "main.py list"),
-    ],
-)
-def test_usage_names_the_command_that_was_typed(
-    command: str, words: list[str], usage: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "argv", [command])
-    assert run_here(main, *words, "--help").stdout.startswith(f"usage: {usage} [-h]")
-
-
-@pytest.mark.parametrize("command", ["hal teleop", "teleop.py"])
-def test_usage_of_a_single_program(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [f"/somewhere/{command}"])
-    assert run_here(teleop.main, "--help").stdout.startswith(f"usage: {command} [-h]")
-
-
-@pytest.mark.parametrize("command", ["hal dataset", "dataset.py"])
-def test_usage_of_a_subcommand(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [f"/somewhere/{command}"])
-    assert run_here(dataset.main, "split", "--help").stdout.startswith(f"usage: {command} split [-h]")
+@pytest.mark.parametrize("words", ["collect", "calibrate board", "dataset split", "list", ""])
+def test_usage_has_the_one_name_of_a_program(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for command in ("/usr/bin/hal", "apps/main.py"):
+        monkeypatch.setattr(sys, "argv", [command])
+        assert run_here(main, *words.split(), "--help").stdout.startswith(f"usage: hal {words}".rstrip() + " [-h]")
+    monkeypatch.setattr(sys, "argv", ["apps/dataset.py"])
+    assert run_here(dataset.main, "split", "--help").stdout.startswith("usage: hal dataset split [-h]")
 
 
 def test_it_runs_a_program() -> None:
@@ -90,8 +55,44 @@ def test_schema_and_version() -> None:
     assert run_here(main, "--version").stdout.startswith("robot-hal ")
 
 
-def test_a_mistake_is_a_message() -> None:
-    for words in (["teleopp"], ["list", "robot"]):
-        with pytest.raises(SystemExit) as done:
-            main(words)
-        assert done.value.code == 2
+@pytest.mark.parametrize(
+    ("words", "text"), [(["teleopp"], "did you mean 'teleop'?"), (["list", "robot"], "kinds: robots, ")]
+)
+def test_a_mistake_is_a_message(words: list[str], text: str) -> None:
+    done = run_here(main, *words)
+    assert done.returncode == 2
+    assert text in done.stderr
+
+
+PACKAGE = """
+from hal.errors import CommandError
+
+def main(arguments):
+    if arguments == ["--wrong"]:
+        raise CommandError("--wrong is wrong")
+    print("there:", *arguments)
+    return 7
+"""
+
+
+def test_an_installed_package_adds_a_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "far_away.py").write_text(PACKAGE)
+    metadata = tmp_path / "far_away-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: far-away\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[hal.apps]\nfar-away = far_away:main\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run_here(main, "far-away", "--here", "x") == (7, "there: --here x\n", "")
+    done = run_here(main, "far-away", "--wrong")
+    assert (done.returncode, done.stderr) == (2, "CommandError: --wrong is wrong\n")
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_without_its_package_a_program_says_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: ())
+    done = run_here(main, name, "--help")
+    folder = BESIDE[name][1]
+    assert (ROOT / folder / "pyproject.toml").is_file()
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"pip install -e {folder}" in line

@@ -71,6 +71,15 @@ def lost(observation):
     return hal.Twist([0.0, 0.0, 0.02])
 
 
+class Stuck:
+    def __init__(self, rig):
+        self.arm = rig.robots["panda"]
+
+    def __call__(self, observation):
+        self.arm.inject(fault="held")
+        return hal.Twist([0.0, 0.0, 0.02])
+
+
 def soft(rig, observation):
     return observation.robots["panda"].controller is hal.ControlMode.OPERATIONAL_SPACE and observation.t > 0.3
 
@@ -261,6 +270,14 @@ def test_an_error_of_the_policy_is_a_failed_episode_and_the_run_continues(folder
     assert "3 ValueError" in done.stdout
     for text in ("ValueError: no idea", "policies.py"):
         assert done.stderr.count(text) == 1
+
+
+def test_a_fault_of_a_simulated_arm_is_a_failed_episode_and_the_run_continues(folder: Path) -> None:
+    done = rollout("--policy", "policies:Stuck", "--episodes", 2, *FAST)
+    assert done.returncode == 1, done.stderr
+    found = report(folder)
+    assert [(episode["code"], episode["success"]) for episode in found["episodes"]] == [("robot_fault", False)] * 2
+    assert (found["ended"], found["reasons"]) == ("", {"robot_fault": 2})
 
 
 def test_an_error_of_a_policys_server_is_one_line(folder: Path) -> None:

@@ -87,6 +87,17 @@ def test_an_engine_named_by_a_model_means_the_engine_of_the_rig(installed: Insta
     assert plan.robots[0].options == {"speed": 1}
 
 
+def test_a_driver_with_a_world_is_an_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one of another package, which nothing here names."""
+    classes = {kind: f"lab_engine:{kind}" for kind in ("robot", "gripper", "camera", "world")}
+    spec = registry.DriverSpec(name="lab_engine", **classes)
+    monkeypatch.setitem(sys.modules, "lab_engine", SimpleNamespace(DRIVER=spec))
+    assert engine(engine="lab_engine:DRIVER") == "lab_engine:DRIVER"
+    assert engine(rig={**PANDA, "simulation": {"engine": "lab_engine:DRIVER"}}) == "lab_engine:DRIVER"
+    with raises_problems("invalid_choice"):
+        load(PANDA, engine="mock")
+
+
 def test_a_wrong_engine_is_a_problem() -> None:
     with raises_problems("invalid_choice"):
         load(PANDA, engine="bullet")

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import threading
 
 import pytest
 
@@ -58,6 +59,27 @@ def test_real_time_waits() -> None:
     clock.sleep(0.01)
     assert clock.now() - before >= 0.01
     clock.sleep_until(clock.now() - 1.0)  # a time in the past is no error
+
+
+def test_an_event_wakes_a_loop_between_its_turns() -> None:
+    woken = threading.Event()
+    ticks = []
+    for tick in RealClock().rate(0.1, wake=woken):
+        ticks.append(tick)
+        if len(ticks) == 3:
+            break
+        woken.set()
+    assert not woken.is_set()
+    assert ticks[2].elapsed < 10.0
+    assert [tick.dt for tick in ticks[1:]] == pytest.approx([b.t - a.t for a, b in itertools.pairwise(ticks)])
+
+
+def test_no_event_wakes_a_loop_in_lock_step() -> None:
+    clock, _ = lock_step()
+    woken = threading.Event()
+    woken.set()
+    ticks = list(itertools.islice(clock.rate(50.0, wake=woken), 3))
+    assert [tick.elapsed for tick in ticks] == pytest.approx([0.0, 0.02, 0.04])
 
 
 @pytest.mark.parametrize("hz", [0.0, -1.0, float("nan")])

@@ -324,8 +324,9 @@ def test_its_own_thread_polls_it_and_close_ends_the_thread(driver: Played) -> No
     pad.start_thread(lambda: driver.reading.t)
     driver.shows("south")
     end = time.monotonic() + 5.0
-    while not pad.wait(0.1).pressed("south"):
+    while not pad.state().pressed("south"):
         assert time.monotonic() < end
+        time.sleep(0.001)
     deadman = pad.hold("l2")
     before = {thread for thread in threading.enumerate() if thread.name == "hal pad pad"}
     assert len(before) == 1
@@ -337,21 +338,17 @@ def test_its_own_thread_polls_it_and_close_ends_the_thread(driver: Played) -> No
     assert not deadman.connected
 
 
-def test_waiting_returns_with_the_next_state_or_after_the_time_out(driver: Played) -> None:
-    pad = Gamepad(driver)
-    pad.open(0.0)
-    pad.start_thread(lambda: 0.0)
-    before = pad.state()
-    assert pad.wait(0.0) is before
-    seen: list[PadState] = []
-    waiter = threading.Thread(target=lambda: seen.append(pad.wait(60.0)))
-    waiter.start()
-    while waiter.is_alive():  # it may have missed the first changes
-        driver.shows("south")
-        waiter.join(0.02)
+def test_a_change_sets_the_events_that_wait_for_it(driver: Played, pad: Gamepad) -> None:
+    changed = threading.Event()
+    pad.wake(changed)
+    pad.poll_once(1.0)
+    assert not changed.is_set(), "a new time is no change"
+    driver.shows("south")
+    pad.poll_once(2.0)
+    assert changed.is_set()
+    changed.clear()
     pad.close()
-    assert seen[0] is not before
-    assert seen[0].pressed("south")
+    assert changed.is_set(), "it is not connected any more"
 
 
 def test_a_closed_pad_is_not_polled(driver: Played, pad: Gamepad) -> None:

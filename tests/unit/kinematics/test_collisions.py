@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import runpy
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_kit import load_benchmark
 
 from hal.config import load
 from hal.errors import CollisionError, CommandError, ConfigError, NotSupported
@@ -174,8 +174,7 @@ def test_pairs_that_always_touch_are_left_out_and_named() -> None:
 
 def test_verdicts_are_those_of_pybullet() -> None:
     pytest.importorskip("pybullet")
-    script = Path(__file__).parents[3] / "benchmarks" / "collisions.py"
-    found = runpy.run_path(str(script))["verdicts"]("panda", 40)
+    found = load_benchmark("collisions").verdicts("panda", 40)
     assert found["colliding"] > 2
     assert found["of those, others by 1 mm or more"] == 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -124,6 +125,85 @@ def test_every_episode_is_made_once_although_workers_die(tmp_path: Path, skills:
     (tmp_path / "other/notes.txt").touch()
     with raises_code(CommandError, "output_exists"):
         generate(recipe, tmp_path / "other", 3)
+
+
+class WorkerWithoutPlace(WorkerHandle):
+    """The first worker is ready, dies once, and records nothing; the others wait for ever, as in a small cluster."""
+
+    deaths: list[int]
+
+    def __init__(self, recipe: dict[str, Any], folder: str, index: int) -> None:
+        self.index, self.killed = index, threading.Event()
+
+    def wait_ready(self) -> None:
+        if self.index:
+            assert self.killed.wait(60.0)
+            raise ConnectionLost("killed")
+
+    def make(self, number: int) -> EpisodeResult:
+        if number in self.deaths:
+            self.deaths.remove(number)
+            raise ConnectionLost("killed")
+        return EpisodeResult(number, number, None, "done")
+
+    def kill(self) -> None:
+        self.killed.set()
+
+    def close(self) -> None:
+        self.killed.set()
+
+
+def test_workers_without_a_place_are_no_dead_ones(tmp_path: Path) -> None:
+    WorkerWithoutPlace.deaths, seen, events = [1, 3], list[GenerateProgress](), list[str]()
+    made = generate(
+        EpisodeRecipe(RIG, skill="skills:wait"),
+        tmp_path / "out",
+        4,
+        workers=3,
+        start_worker=WorkerWithoutPlace,
+        on_progress=seen.append,
+        on_event=events.append,
+    )
+    assert [result.number for result in made] == [0, 1, 2, 3]
+    assert [(event.split()[1], event.split()[5].strip(",")) for event in events] == [("0", "1"), ("0", "3")]
+    assert (seen[-1].restarts, seen[-1].waiting) == (2, 0)
+
+
+@pytest.mark.slow
+def test_uploaded_episodes_of_a_dead_worker_are_kept(tmp_path: Path, skills: Any) -> None:
+    pytest.importorskip("fsspec", reason="pip install 'robot-hal[ray]'")
+    recipe, address, out = EpisodeRecipe(RIG, skill="skills:wait"), (tmp_path / "bucket").as_uri(), tmp_path / "out"
+    WorkerHere.before, WorkerHere.after = [2, 2, 2], [1]
+    with raises_code(EpisodeFailed, "worker_dies"):
+        generate(recipe, out, 3, upload=address, start_worker=WorkerHere)
+    assert len(list(tmp_path.glob("bucket/*/*.true.zip"))) == 2
+    assert not any(tmp_path.glob("out*/**/*.json")), "nothing is recorded beside the result"
+    with raises_code(CommandError, "other_recipe"):
+        generate(replace(recipe, seed=1), out, 3, upload=address, start_worker=WorkerHere)
+    made = generate(recipe, out, 3, upload=address, start_worker=WorkerHere)
+    assert [result.number for result in made] == [2], "the others were there"
+    assert [episode.info["seed"] for episode in Dataset(out).episodes] == [0, 1, 2]
+    assert [path for path in (tmp_path / "bucket").rglob("*") if path.is_file()] == []
+
+
+def test_a_rig_file_of_the_program_is_found_in_the_working_directory(
+    tmp_path: Path, skills: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Any] = []
+
+    def refuse(**options: Any) -> None:
+        opened.append(options["config"])
+        raise CommandError("not now")
+
+    monkeypatch.setattr("hal.open", refuse)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "here.yaml").touch()
+    for config in ("/elsewhere/rigs/a.yaml", str(tmp_path / "here.yaml"), "panda_table"):
+        worker = EpisodeWorker(asdict(EpisodeRecipe({"config": config}, skill="skills:wait")), "part", (), "/elsewhere")
+        assert worker.recipe.rig["config"] == config, "the same recipe on every computer"
+        with pytest.raises(CommandError):
+            worker.make(0)
+    assert opened == [str(tmp_path / "rigs/a.yaml"), str(tmp_path / "here.yaml"), "panda_table"]
 
 
 def test_how_a_skill_ends_decides_the_mark(tmp_path: Path, skills: Any) -> None:

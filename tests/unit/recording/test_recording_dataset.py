@@ -196,7 +196,7 @@ def test_the_suggested_command_recovers_an_unfinished_episode(tmp_path: Path) ->
         Dataset(out)
     words = shlex.split(str(caught.value).partition("with: ")[2])
     done = subprocess.run(
-        [sys.executable, "-m", "hal.apps.review", *words[1:]], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "hal.apps.main", *words[1:]], capture_output=True, text=True, timeout=60
     )
     assert "recovered as episode 0" in done.stdout, done.stderr
     assert len(Dataset(out)) == 1

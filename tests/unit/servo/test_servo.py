@@ -6,20 +6,21 @@ import math
 import random
 
 import pytest
-from servo_kit import STILL, Bench, N, load_streams
+from benchmark_kit import load_benchmark
+from servo_kit import STILL, Bench, N
 from specs import PANDA_HOME
 
 from hal.commands import Kind, Session
 from hal.errors import CommandError, ControlTaken
 from hal.types import Limited, RobotStatus, Trip
 
-streams = load_streams()
+streams = load_benchmark("servo_streams")
 
 
 @pytest.mark.slow
 def test_random_target_streams() -> None:
     """What the benchmark does 10,000 times."""
-    results = [streams.run(seed) for seed in range(120)]
+    results = [streams.run_stream(seed) for seed in range(120)]
     for result in results:
         assert all(peak <= 1.0 for peak in result.peaks.values()), (result.description, result.peaks)
         assert result.ratio <= 1.2, (result.description, result.ratio)

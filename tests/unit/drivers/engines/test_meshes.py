@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import runpy
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from hal.kinematics.hulls import convex_hull, mesh_hulls, uniform_solid
 from hal.specs import BodySpec
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-BENCHMARK = runpy.run_path(str(Path(__file__).parents[4] / "benchmarks" / "meshes.py"))
 
 
 def mesh(path: Path, at: tuple[float, float, float] = (0.0, 0.0, 0.5), **changes: Any) -> BodySpec:
@@ -38,13 +37,85 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def bowl() -> Any:
+    """Return the lower half of a ball's surface, which is not closed."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.06)
+    return trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0.0])
+
+
+def table() -> Any:
+    """Return a slab on four legs, which is not convex."""
+    legs = [trimesh.creation.box((0.02, 0.02, 0.1)) for _ in range(4)]
+    for k, leg in enumerate(legs):
+        leg.apply_translation((0.08 * (-1) ** k, 0.05 * (-1) ** (k // 2), -0.05))
+    return trimesh.util.concatenate([trimesh.creation.box((0.2, 0.14, 0.02)), *legs])
+
+
+def turned(mesh: Any, *angles: float) -> Any:
+    """Return a mesh in another pose than that of its axes, off its origin."""
+    mesh.apply_transform(hal.Pose.from_rpy((0.3, -0.2, 0.4), angles).matrix())
+    return mesh
+
+
+def random_points() -> Any:
+    """Return the hull of random points."""
+    return solid(np.random.default_rng(2).normal(0.0, 0.03, (60, 3)))
+
+
+def solid(points: Any) -> Any:
+    """Return the convex hull of points."""
+    hull = convex_hull(np.array(points, float))
+    return trimesh.Trimesh(hull.points, hull.faces)
+
+
+SHAPES: dict[str, Callable[[], Any]] = {
+    "box": lambda: trimesh.creation.box((0.1, 0.2, 0.3)),
+    "heavy": lambda: trimesh.creation.torus(0.05, 0.02, major_sections=320, minor_sections=160),
+    "bowl": bowl,
+    "slab": lambda: trimesh.creation.box((0.3, 0.2, 0.01)),
+    "ball": lambda: trimesh.creation.icosphere(subdivisions=5, radius=0.05),
+    "cylinder": lambda: trimesh.creation.cylinder(0.04, 0.1, sections=1000),
+    "cone": lambda: trimesh.creation.cone(0.05, 0.1, sections=64),
+    "capsule": lambda: trimesh.creation.capsule(0.1, 0.03),
+    "table": table,
+    "turned": lambda: turned(trimesh.creation.box((0.1, 0.1, 0.2)), 0.4, 0.3, 0.2),
+    "random": random_points,
+    "annulus": lambda: trimesh.creation.annulus(0.03, 0.06, 0.04),
+    "die": lambda: trimesh.creation.icosahedron().apply_scale(0.04),
+    "rod": lambda: trimesh.creation.cylinder(0.006, 0.2, sections=48),
+    "tilted": lambda: turned(trimesh.creation.torus(0.06, 0.015, major_sections=48, minor_sections=24), 1.2, 0.0, 0.5),
+    "small": lambda: trimesh.creation.box((0.01, 0.012, 0.008)),
+    "large": lambda: trimesh.creation.box((0.8, 0.6, 0.5)),
+    "wedge": lambda: solid([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0.1, 0.1, 0), (0, 0, 0.08), (0, 0.1, 0.08)]),
+    "coarse": lambda: trimesh.creation.uv_sphere(radius=0.05, count=[8, 8]),
+    "pair": lambda: trimesh.util.concatenate(
+        [trimesh.creation.box((0.05, 0.05, 0.05)), turned(trimesh.creation.box((0.05, 0.05, 0.05)), 0.5, 0.0, 0.0)]
+    ),
+}
+"""What the files show, by their names; every second one is an STL file."""
+
+
+def write_files(folder: Path, names: Iterable[str]) -> list[Path]:
+    """Write the files of some of :data:`SHAPES`."""
+    files, every = [], list(SHAPES)
+    for name in names:
+        files.append(folder / f"{name}.{'stl' if every.index(name) % 2 else 'obj'}")
+        SHAPES[name]().export(files[-1])
+    return files
+
+
 @pytest.mark.parametrize("names", [["bowl", "slab", "table"], pytest.param(None, marks=pytest.mark.slow, id="all")])
 def test_meshes_load_and_rest_on_the_floor(engine: Engine, tmp_path: Path, names: list[str] | None) -> None:
-    """Those of ``benchmarks/meshes.py``: among them one of 102,400 faces, and a bowl, which is not closed."""
-    for file in BENCHMARK["write_files"](tmp_path, names or BENCHMARK["SHAPES"]):
-        lowest, speed, _ = BENCHMARK["rest"](engine.name, file)
-        assert abs(lowest) <= 1e-3, file.name
-        assert speed < 0.1, file.name  # balls roll on their corners
+    """Among them one of 102,400 faces, and a bowl, which is not closed."""
+    for file in write_files(tmp_path, names or SHAPES):
+        points = np.concatenate([hull.points for hull in mesh_hulls(file)])
+        world = engine.world(floor(), mesh(file, (0.0, 0.0, 0.001 - points[:, 2].min()), mass=0.5))
+        for _ in range(240):
+            world.step()
+        matrix = hal.Pose(**world.pose("it")).matrix()
+        assert abs((points @ matrix[2, :3] + matrix[2, 3]).min()) <= 1e-3, file.name
+        assert np.linalg.norm(world.velocity("it")[0]) < 0.1, file.name  # balls roll on their corners
+        world.close()
 
 
 def test_a_mesh_has_the_mass_and_inertia_of_its_hull(engine: Engine, pair: Path) -> None:

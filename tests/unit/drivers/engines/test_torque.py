@@ -193,7 +193,7 @@ class TestDriver:
         world.close()
 
     def test_the_same_torques_move_a_simulated_fr3_and_the_emulators_alike(self, engine: Engine) -> None:
-        """On both they come on top of gravity alone: no Coriolis torques, no drag. See benchmarks/dynamics.py."""
+        """On both they come on top of gravity alone: no Coriolis torques, no drag."""
         spec = load("franka", sim=True).resolve().robots[0]
         world = engine.world(replace(spec, base_position=(0.0, 0.0, 0.0)), physics_hz=1000.0)
         driver, body = engine.robot(world), RigidBody(Path(spec.urdf))

@@ -1,0 +1,148 @@
+"""``hal calibrate gripper``: find the closed position of a gripper's motor while a dead-man is held."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from hal.apps._common import (
+    ACTION_NEEDED,
+    add_rig_options,
+    check_one_robot,
+    resolve_plan,
+    rig_options,
+    robot_names,
+    select_robots,
+)
+
+if TYPE_CHECKING:
+    from hal.deadman import Deadman
+    from hal.gamepad import Gamepad
+    from hal.gripper import Gripper, GripperResult
+    from hal.rig import Rig
+    from hal.specs import Plan, RobotSpec
+
+__all__ = ["find_zero", "gripper_parser"]
+
+LONGEST = 120.0
+"""Time after which the search ends, s, however long the dead-man was held."""
+_PERIOD = 0.01
+"""Time between two looks at the dead-man, s."""
+
+
+def gripper_parser() -> argparse.ArgumentParser:
+    """Return the parser of ``hal calibrate gripper``."""
+    made = argparse.ArgumentParser(
+        prog="hal calibrate gripper",
+        description="Find where a gripper is closed, for one whose motor has its zero elsewhere. It closes slowly, "
+        "with little force, while the dead-man is held, until something stops it. The arm is not switched on. The "
+        "result is an entry for the rig file.",
+        epilog="An object between the fingers, or fingers that jam, cannot be told from closed fingers: take "
+        "everything out, and look at them.",
+    )
+    add_rig_options(made)
+    made.add_argument("--robot", metavar="NAME", help="its arm (default: the first)")
+    return made
+
+
+def find_zero(args: argparse.Namespace) -> int:
+    """Run the program; return the exit status."""
+    import hal
+    from hal.apps._display import banner, list_links
+    from hal.apps.check import may_open
+
+    check_one_robot(args)
+    args.overrides = [*args.overrides, "cameras={}"]
+    plan = resolve_plan(args)
+    if plan is None:
+        return 0
+    spec, motor = _find_motor(plan, args)
+    if not may_open(plan):
+        return ACTION_NEEDED
+    with hal.open(**rig_options(args)) as rig:
+        print(f"{banner(rig)}\n{list_links(rig)}", flush=True)
+        (robot,) = select_robots(rig, args)
+        gripper = robot.gripper
+        assert gripper is not None
+        deadman = _find_deadman(rig, spec)
+        result = close_while_held(rig, gripper, deadman)
+        if result.fault is not None:
+            raise hal.RobotFault(result.fault.cause, result.fault.remedy, code=result.fault.code)
+        groups = rig.statistics().values()
+        offset = next(group["grippers"][gripper.name] for group in groups if gripper.name in group["grippers"])[
+            "offset"
+        ]
+    before = motor.get("offset", 0.0)
+    entry = ", ".join(f"{key}: {value}" for key, value in {**motor, "offset": round(offset, 4) + 0.0}.items())
+    print(
+        f"  the fingers are stopped {before - offset:+.3f} rad from the rig's closed position. If they are closed, and"
+    )
+    print("  nothing is between them, write this into the rig file:\n")
+    print(f"robots:\n  {spec.name}:\n    gripper: {{real: {{motor: {{{entry}}}}}}}")
+    return 0
+
+
+def _find_motor(plan: Plan, args: argparse.Namespace) -> tuple[RobotSpec, dict[str, Any]]:
+    """Return the arm, and the settings of its gripper's motor. Raises NotSupported."""
+    from hal.errors import NotSupported
+
+    name = next(iter(robot_names(args)), plan.robots[0].name)
+    spec = next(robot for robot in plan.robots if robot.name == name)
+    motor = None if spec.gripper is None else spec.gripper.options.get("motor")
+    if motor is None:
+        text = f"{name} has no gripper whose motor needs a zero: it is simulated, knows its own, or there is none"
+        raise NotSupported(text, code="no_gripper_motor")
+    return spec, motor
+
+
+def _find_deadman(rig: Rig, spec: RobotSpec) -> Deadman:
+    """Return the dead-man of the rig's pad, and say how it is used.
+
+    Raises:
+        CommandError: The rig has no pad.
+        NotSupported: It must not be the dead-man of a real gripper.
+    """
+    from hal.config.mapping import load_mapping
+    from hal.errors import CommandError
+
+    pad: Gamepad | None = next(iter(rig.gamepads.values()), None)
+    if pad is None:
+        raise CommandError(f"{rig.plan.source} has no gamepad to hold as the dead-man; see --pad", code="no_gamepad")
+    control = load_mapping(pad.mapping or "default").deadman
+    deadman = pad.hold(control)
+    if spec.attended and not spec.emulated:
+        deadman.check_trust()
+    name = pad.control_name(control)
+    how = f"hold {name}: the fingers close only while it is held" if pad.can_hold else f"press {name}: one step each"
+    text = f"take everything out from between the fingers; then {how}"
+    print(f"  {text}", flush=True)
+    rig.say(text)
+    return deadman
+
+
+def close_while_held(rig: Rig, gripper: Gripper, deadman: Deadman) -> GripperResult:
+    """Close the gripper whenever the dead-man is held, until it is closed; a release stops the fingers at once.
+
+    Raises:
+        MotionStopped: The rig was stopped, or the search took longer than :data:`LONGEST`.
+    """
+    from hal.errors import MotionStopped
+    from hal.types import GripperOutcome
+
+    clock, motion = rig.clock, None
+    end = clock.now() + LONGEST
+    while clock.now() < end:
+        held = deadman.holds(clock.now())
+        if motion is not None and motion.done:
+            result = motion.wait()
+            if result.outcome is GripperOutcome.STOPPED:
+                raise MotionStopped("the gripper was stopped", code="gripper_stopped")
+            return result
+        if motion is None and held:
+            motion = gripper.start_home()
+        elif motion is not None and not held:
+            gripper.stop()
+            motion = None
+        clock.sleep(_PERIOD)
+    gripper.stop()
+    raise MotionStopped(f"nothing stopped the fingers within {LONGEST:g} s", code="not_closed")
