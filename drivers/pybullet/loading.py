@@ -189,6 +189,7 @@ def _load_urdf(
     with loadable_urdf(path, tight) as file, silenced() as captured:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
+            flags |= client.URDF_USE_IMPLICIT_CYLINDER  # else cylinders are hulls, and larger by MARGIN
             if not drawn:
                 flags |= client.URDF_IGNORE_VISUAL_SHAPES
             number = client.loadURDF(file, useFixedBase=fixed, globalScaling=scale, flags=flags)
