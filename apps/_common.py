@@ -231,18 +231,18 @@ def resolve_plan(
     """
     from hal.apps._display import list_devices
     from hal.config import load
-    from hal.config.files import nearest
+    from hal.config.files import suggest
     from hal.errors import DeviceNotFound
 
     plan = load(**config_options(args), clock=clock).resolve()
     robots = [robot.name for robot in plan.robots]
     for name in robot_names(args):
         if name not in robots:
-            raise DeviceNotFound(f"--robot: this rig has no robot {name!r}{nearest(name, robots)}")
+            raise DeviceNotFound(f"--robot: this rig has no robot {name!r}{suggest(name, robots)}")
     known = [camera.name for camera in plan.cameras]
     for name in cameras:
         if name not in known:
-            raise DeviceNotFound(f"--cameras: this rig has no camera {name!r}{nearest(name, known)}")
+            raise DeviceNotFound(f"--cameras: this rig has no camera {name!r}{suggest(name, known)}")
     if not args.dry_run:
         return plan
     check_everything(plan, args)

@@ -92,7 +92,7 @@ def _board(args: argparse.Namespace) -> Board:
     from hal.calibration import load_board
 
     board = load_board(args.board)
-    return board if args.square is None else board.measured(args.square)
+    return board if args.square is None else board.resize(args.square)
 
 
 def _print_board(args: argparse.Namespace) -> int:

@@ -1,7 +1,9 @@
-"""Pre-flight check of this computer, the arm and the network between them; or a list of pads, cameras, CAN adapters.
+"""Pre-flight check of this computer, the arm and the network between them; or a list of pads, cameras, CAN adapters; or
+the physics of the simulation beside theory.
 
 hal check --real --config my_rig.yaml
 hal check --pads
+hal check --physics --engine mujoco
 """
 
 from __future__ import annotations
@@ -335,6 +337,33 @@ def _bar(value: float) -> str:
     return f"[{left}|{right}]"
 
 
+# --physics: experiments in the simulated world, beside theory.
+
+
+def check_physics(engine: str, as_json: bool) -> bool:
+    """Run the experiments of :mod:`._physics` on an engine and print them; return whether all agree with theory."""
+    from hal import registry
+
+    from ._physics import ALLOWED, run_experiments
+
+    engine = registry.choose_engine(engine)
+    registry.check_engine(engine)
+    rows, fit = [], True
+    if not as_json:
+        print(f"{' '.join([engine, *registry.versions(engine).values()])}; at most {100 * ALLOWED:g} % from theory\n")
+        print(f"{'':10s}{'':44s}{'theory':>10s}{'measured':>10s}")
+    for row in run_experiments(engine):
+        good = bool(abs(row.difference) <= ALLOWED)
+        fit = fit and good
+        rows.append(row._asdict() | {"difference": row.difference, "fit": good})
+        if not as_json:
+            numbers = f"{row.theory:10.4f}{row.measured:10.4f} {row.unit:7s}{100 * row.difference:+6.2f} %"
+            print(f"{_SHOWN['ok' if good else 'fail']:10s}{row.name:44s}{numbers}", flush=True)
+    if as_json:
+        print(json.dumps({"engine": engine, "fit": fit, "rows": rows}, indent=2))
+    return fit
+
+
 _BRIEF_DURATION = 0.5
 """Duration of the measurements before a program opens a rig, s."""
 _DURATION = 2.0
@@ -370,6 +399,12 @@ def parser() -> argparse.ArgumentParser:
         help="instead, list the CAN interfaces and adapters, with the command that brings one up. The exit status is 2 "
         "if there is none",
     )
+    made.add_argument(
+        "--physics",
+        action="store_true",
+        help="instead, run experiments whose results are known from theory in the simulation (--engine), and print the "
+        "differences; it takes some seconds. The exit status is 2 if one is above 3 %%",
+    )
     return made
 
 
@@ -389,6 +424,8 @@ def _main(args: argparse.Namespace) -> int:
         return 0 if show_cameras() else ACTION_NEEDED
     if args.can:
         return 0 if show_can() else ACTION_NEEDED
+    if args.physics:
+        return _physics(args)
     duration = _DURATION if args.duration is None else args.duration
     if not 0.0 < duration <= 60.0:
         raise CommandError(f"--duration must be above 0 and at most 60, not {duration:g}")
@@ -402,6 +439,15 @@ def _main(args: argparse.Namespace) -> int:
         if not real_arms(plan) and not checked_cameras(plan):
             print("no device checks for this rig; checked this computer only")
     return 0 if _fit(found) else ACTION_NEEDED
+
+
+def _physics(args: argparse.Namespace) -> int:
+    from hal.errors import CommandError
+
+    others = [args.overrides, args.sim is False, args.config != parser().get_default("config"), args.duration]
+    if any(others):
+        raise CommandError("--physics has rigs of its own: it takes --engine and --json, and no other option")
+    return 0 if check_physics(args.engine or "auto", args.json) else ACTION_NEEDED
 
 
 def _pads(args: argparse.Namespace) -> int:

@@ -10,8 +10,14 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hal.apps._common import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from hal.robot import Robot
 
 __all__ = ["main", "parser"]
 
@@ -122,15 +128,20 @@ def _main(args: argparse.Namespace) -> int:
             notes = [*recovered, *recorder.notes]
             if demo:
                 judge = judge or lifts_cube(rig, robots[0])
-                if judge is None:
-                    notes.append(f"--pad demo: whether {robots[0].name} lifts a cube is not checked; see --success")
-                if any(robot.spec.attended for robot in robots):
-                    notes.append(DEMO_DRIVES_HOME)
-                if args.seed or recorder.episodes:
-                    notes.append(DEMO_MISPLACED)
+                notes += _list_demo_limits(robots, judged=judge is not None, fresh=not (args.seed or recorder.episodes))
             for note in notes:
                 print(f"  note     {note}")
             return CollectRun(rig, robots, recorder, args, judge).run()
+
+
+def _list_demo_limits(robots: Sequence[Robot], judged: bool, fresh: bool) -> Iterator[str]:
+    """Yield what the recorded demonstrations cannot do in this run."""
+    if not judged:
+        yield f"--pad demo: whether {robots[0].name} lifts a cube is not checked; see --success"
+    if any(robot.spec.attended for robot in robots):
+        yield DEMO_DRIVES_HOME
+    if not fresh:
+        yield DEMO_MISPLACED
 
 
 if __name__ == "__main__":

@@ -39,11 +39,15 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add(name: str, what: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=what, description=what[0].upper() + what[1:] + ".")
+    def add(name: str, what: str, episodes: bool = False) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=what, description=what[0].upper() + what[1:] + ".")
+        if name != "merge":
+            command.add_argument("dataset", metavar="DATASET", help="folder of a recording")
+        if episodes:
+            command.add_argument("episodes", metavar="EPISODES", help="numbers, for example 0,3-5")
+        return command
 
     listing = add("list", "list the episodes, or some of them")
-    listing.add_argument("dataset", metavar="DATASET", help="folder of a recording")
     marks = listing.add_mutually_exclusive_group()
     marks.add_argument("--succeeded", dest="mark", action="store_const", const="success", help="marked a success")
     marks.add_argument("--failed", dest="mark", action="store_const", const="failure", help="marked a failure")
@@ -54,31 +58,20 @@ def parser() -> argparse.ArgumentParser:
     listing.add_argument("--dropped", action="store_true", help="in which rows were dropped")
     listing.add_argument("--numbers", action="store_true", help="print only the numbers, for another command")
 
-    for name, what in (("delete", "delete episodes"), ("extract", "write some episodes into a new dataset")):
-        some = add(name, what)
-        some.add_argument("dataset", metavar="DATASET", help="folder of a recording")
-        some.add_argument("episodes", metavar="EPISODES", help="numbers, for example 0,3-5")
-        if name == "delete":
-            some.add_argument("--yes", action="store_true", help="do not ask")
-        else:
-            some.add_argument("--out", required=True, metavar="DIR", help="new folder")
-
-    mark = add("mark", "mark episodes as a success or a failure, or remove the mark")
-    mark.add_argument("dataset", metavar="DATASET", help="folder of a recording")
-    mark.add_argument("episodes", metavar="EPISODES", help="numbers, for example 0,3-5")
-    mark.add_argument("mark", choices=MARKS, help="the mark")
-
+    deleting = add("delete", "delete episodes", episodes=True)
+    deleting.add_argument("--yes", action="store_true", help="do not ask")
+    extracting = add("extract", "write some episodes into a new dataset", episodes=True)
+    extracting.add_argument("--out", required=True, metavar="DIR", help="new folder")
+    marking = add("mark", "mark episodes as a success or a failure, or remove the mark", episodes=True)
+    marking.add_argument("mark", choices=MARKS, help="the mark")
     task = add("task", "change the task of episodes")
-    task.add_argument("dataset", metavar="DATASET", help="folder of a recording")
     task.add_argument("task", metavar="TEXT", help="description of the task")
     task.add_argument("--episodes", metavar="EPISODES", help="numbers, for example 0,3-5 (default: all)")
-
     merging = add("merge", "merge datasets that were recorded with the same rig")
     merging.add_argument("datasets", nargs="+", metavar="DATASET", help="folders of recordings; they are only read")
     merging.add_argument("--out", required=True, metavar="DIR", help="new folder")
 
     splitting = add("split", "write several datasets of the episodes of one, which is only read")
-    splitting.add_argument("dataset", metavar="DATASET", help="folder of a recording")
     splitting.add_argument("--out", required=True, metavar="DIR", help="new folder, with a folder for each part")
     ways = splitting.add_mutually_exclusive_group(required=True)
     ways.add_argument("--shares", metavar="NAME=SHARE,...", help="at random, for example train=0.8,val=0.2")
@@ -86,26 +79,23 @@ def parser() -> argparse.ArgumentParser:
     ways.add_argument("--by-mark", action="store_true", help="into success, failure and unmarked")
     splitting.add_argument("--seed", type=int, default=0, help="of the random order (%(default)s)")
 
-    trimming = add("trim", "remove the rows at both ends of episodes in which neither arm nor gripper moves")
-    trimming.add_argument("dataset", metavar="DATASET", help="folder of a recording")
-    trimming.add_argument("episodes", metavar="EPISODES", nargs="?", help="numbers, for example 0,3-5 (default: all)")
-    trimming.add_argument(
-        "--speed", type=float, default=0.02, metavar="RAD_S", help="slowest motion of a joint, rad/s (%(default)s)"
-    )
-    trimming.add_argument(
-        "--width", type=float, default=0.001, metavar="M", help="smallest motion of a gripper, m (%(default)s)"
-    )
-    trimming.add_argument(
-        "--keep", type=float, default=0.2, metavar="S", help="time to keep before and after the motion, s (%(default)s)"
-    )
-    trimming.add_argument("--out", metavar="DIR", help="new folder (default: replace the dataset)")
-    trimming.add_argument("--dry-run", action="store_true", help="only print what would be removed")
-    trimming.add_argument("--yes", action="store_true", help="do not ask")
-
-    add("pack", "join the files of episodes, which recorders do from 100 on").add_argument("dataset", metavar="DATASET")
-    add("check", "compare every file with the index").add_argument("dataset", metavar="DATASET")
-    add("repair", "finish interrupted episodes, and rebuild a lost index").add_argument("dataset", metavar="DATASET")
+    _add_trim_options(add("trim", "remove the rows at both ends of episodes in which neither arm nor gripper moves"))
+    add("pack", "join the files of episodes, which recorders do from 100 on")
+    add("check", "compare every file with the index")
+    add("repair", "finish interrupted episodes, and rebuild a lost index")
     return made
+
+
+def _add_trim_options(trimming: argparse.ArgumentParser) -> None:
+    add = trimming.add_argument
+    add("episodes", metavar="EPISODES", nargs="?", help="numbers, for example 0,3-5 (default: all)")
+    add("--speed", type=float, default=0.02, metavar="RAD_S", help="slowest motion of a joint, rad/s (%(default)s)")
+    add("--width", type=float, default=0.001, metavar="M", help="smallest motion of a gripper, m (%(default)s)")
+    kept = "time to keep before and after the motion, s (%(default)s)"
+    add("--keep", type=float, default=0.2, metavar="S", help=kept)
+    add("--out", metavar="DIR", help="new folder (default: replace the dataset)")
+    add("--dry-run", action="store_true", help="only print what would be removed")
+    add("--yes", action="store_true", help="do not ask")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -106,7 +106,7 @@ def _find_program(name: str) -> Callable[[list[str]], int]:
         return main
     from importlib.metadata import entry_points  # slow to import, so only when it is needed
 
-    from hal.config.files import nearest
+    from hal.config.files import suggest
     from hal.errors import CommandError, DriverMissing
 
     for point in entry_points(group=GROUP, name=name):
@@ -117,7 +117,7 @@ def _find_program(name: str) -> Callable[[list[str]], int]:
         message = f"hal {name} is a package of its own: pip install -e {folder}, in the repository of robot-hal"
         raise DriverMissing(message, code="missing_package")
     programs = [*PROGRAMS, *BESIDE, *(point.name for point in entry_points(group=GROUP)), "list", "schema"]
-    raise CommandError(f"there is no program {name!r}{nearest(name, set(programs))}", code="unknown_program")
+    raise CommandError(f"there is no program {name!r}{suggest(name, set(programs))}", code="unknown_program")
 
 
 def _list(arguments: list[str]) -> int:

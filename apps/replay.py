@@ -95,10 +95,10 @@ def _main(args: argparse.Namespace) -> int:
 
 def _driven(rig: Rig, episode: Episode) -> str:
     """Return the arm that was driven, else the rig's first one in the recording, else the rig's first one."""
-    from hal.learning.replay import recorded_arms
+    from hal.learning.replay import list_recorded_arms
 
     driven = str(episode.info.get("info", {}).get("robot"))
-    recorded = recorded_arms(episode)
+    recorded = list_recorded_arms(episode)
     if driven in rig.robots:
         return driven
     return next((name for name in rig.robots if name in recorded), next(iter(rig.robots)))
@@ -107,7 +107,7 @@ def _driven(rig: Rig, episode: Episode) -> str:
 def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
     """Yield lines for the banner: the arm, other arms that moved in the recording, and damaged images."""
     from hal.errors import DatasetError
-    from hal.learning.replay import other_moving_arms
+    from hal.learning.replay import list_other_arms
     from hal.recording.layout import GRIP_FORCE
 
     yield f"replays  {robot.name}"
@@ -117,7 +117,7 @@ def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
         yield f"damaged  {error}; images are not needed here"
     if robot.gripper is not None and GRIP_FORCE not in episode.columns:
         yield "fingers  this recording lacks the gripper's force: grasps of scripts and skills touch, and do not press"
-    for name in other_moving_arms(episode, robot.name):
+    for name in list_other_arms(episode, robot.name):
         yield f"still    {name} moved in the recording; it is not replayed"
 
 

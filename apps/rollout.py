@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     import hal
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
+    from hal.gamepad import Gamepad
     from hal.geometry import Pose
     from hal.learning.policy import Policy, PolicyOutcome
     from hal.learning.policy_config import PolicyConfig
@@ -277,29 +278,30 @@ class RolloutRun:
         from hal.learning.takeover import Takeover
         from hal.teleop import Teleop
 
-        self.rig, self.args, self.recorder = rig, args, recorder
-        self.robots = policy.robots if isinstance(policy, RemotePolicy) else {robot.name: robot}
-        """The arms that the policy moves, by name."""
-        self.robot = robot if robot.name in self.robots else next(iter(self.robots.values()))
-        """The arm that a person drives in a takeover."""
-        self.deadman = deadman
-        self.pad = next(iter(rig.gamepads.values()), None) if deadman is not None else None
-        self.button = self.pad.control_name(mapping.deadman) if self.pad is not None and mapping is not None else ""
-        """Name of the dead-man's control, if it must be held."""
-        actions = mapping.actions if mapping is not None else {}
-        self.marks = {actions[action]: mark for action, mark in MARKS.items() if action in actions}
-        """Button -> how it marks an episode."""
-        self.line = StatusLine()
-        self.takeover: Takeover | None = None
-        if args.takeover and mapping is not None and self.pad is not None:
-            self.takeover = Takeover(Teleop(self.robot, mapping), self.pad)
-        if recorder is not None:
-            recorder.source = self._driver
+        self.rig, self.args, self.recorder, self.deadman = rig, args, recorder, deadman
         self.remote = policy if isinstance(policy, RemotePolicy) else None
         """The policy, if it is on a server."""
         self.figures: Callable[[], dict[str, Any]] = dict if self.remote is None else self.remote.statistics
         """Returns the figures of a policy on a server."""
-        self._noted, self._next_note = "", 0.0
+        self.robots = {robot.name: robot} if self.remote is None else self.remote.robots
+        """The arms that the policy moves, by name."""
+        self.robot = self.robots.get(robot.name) or next(iter(self.robots.values()))
+        """The arm that a person drives in a takeover."""
+        self.pad: Gamepad | None = None
+        self.button = ""
+        """Name of the dead-man's control, if it must be held."""
+        self.marks: dict[str, bool] = {}
+        """Button -> how it marks an episode."""
+        self.takeover: Takeover | None = None
+        if mapping is not None:
+            self.pad = next(iter(rig.gamepads.values()))
+            self.button = self.pad.control_name(mapping.deadman)
+            self.marks = {mapping.actions[name]: mark for name, mark in MARKS.items() if name in mapping.actions}
+            if args.takeover:
+                self.takeover = Takeover(Teleop(self.robot, mapping), self.pad)
+        self.line, self._noted, self._next_note = StatusLine(), "", 0.0
+        if recorder is not None:
+            recorder.source = self._driver
         self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
             rig,
@@ -310,7 +312,7 @@ class RolloutRun:
             deadman=deadman,
             unattended=args.unattended or mapping is None,
             controller=make_controller(args.controller),
-            cameras=policy.config.cameras() if isinstance(policy, RemotePolicy) else None,
+            cameras=None if self.remote is None else self.remote.config.cameras(),
             history=args.history,
             success=load_object(args.success, "--success") if args.success else None,
             mark=self._mark,

@@ -116,43 +116,52 @@ def describe(info: Mapping[str, Any], inputs: Collection[str]) -> dict[str, Any]
             ``unknown_input``), or the recording is of another program (``foreign_dataset``).
     """
     features = info["features"]
+    arms = _group_columns(features)
+    state: list[str] = []
+    actions: list[dict[str, Any]] = []
+    first = 0
+    for arm, columns in arms.items():
+        # The action of a row is the set-point one row later.
+        action: dict[str, Any] = {"kind": "joint_position", "first": 1}
+        if arm:
+            action |= {"robot": arm, "columns": [first, first + len(columns)]}
+        lead = f"{arm}." if arm else ""
+        state.append(f"{lead}q")
+        if GRIPPER in columns:
+            state.append(f"{lead}width")
+            action["gripper"] = {"metres": True}
+        actions.append(action)
+        first += len(columns)
+    observation = {"task": {"text": "task"}, **{key: _describe_input(key, features, state) for key in inputs}}
+    config: dict[str, Any] = {"rate_hz": info["fps"], "observation": observation}
+    config |= {"action": actions[0]} if "" in arms else {"arms": actions}
+    joints = [name for name in features[ACTION]["names"] if name.rpartition(".")[2] != GRIPPER]
+    return {"joints": joints, "robot_type": info.get("robot_type"), "policy_config": config}
+
+
+def _group_columns(features: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return the columns of the action by arm; the arm of a recording of one is ``""``. Raises CommandError."""
     names = list(features[ACTION]["names"] or [])
     arms: dict[str, list[str]] = {}
     for name in names:
-        lead, _, own = name.rpartition(".")
-        arms.setdefault(lead, []).append(own)
-    grouped = [f"{lead}.{own}" if lead else own for lead, parts in arms.items() for own in parts]
-    foreign = any(GRIPPER in parts[:-1] for parts in arms.values()) or ("" in arms and len(arms) > 1)
+        arm, _, column = name.rpartition(".")
+        arms.setdefault(arm, []).append(column)
+    grouped = [f"{arm}.{column}" if arm else column for arm, columns in arms.items() for column in columns]
+    foreign = any(GRIPPER in columns[:-1] for columns in arms.values()) or ("" in arms and len(arms) > 1)
     if not names or foreign or features.get(STATE, {}).get("names") != names or grouped != names:
         raise CommandError(f"{STATE} and {ACTION} of the dataset are not joints and a gripper", code="foreign_dataset")
-    state: list[str] = []
-    actions: list[dict[str, Any]] = []
-    for lead, parts in arms.items():
-        # The action of a row is the set-point one row later.
-        action: dict[str, Any] = {"kind": "joint_position", "first": 1}
-        if lead:
-            first = sum(action["columns"][1] - action["columns"][0] for action in actions)
-            action |= {"robot": lead, "columns": [first, first + len(parts)]}
-        state.append(f"{lead}.q" if lead else "q")
-        if GRIPPER in parts:
-            state.append(f"{lead}.width" if lead else "width")
-            action["gripper"] = {"metres": True}
-        actions.append(action)
-    observation: dict[str, Any] = {"task": {"text": "task"}}
-    for key in inputs:
-        if key == STATE:
-            observation[key] = {"state": state}
-        elif key == ENVIRONMENT and key in features:
-            objects = [name.rpartition(".")[0] for name in features[key]["names"]]
-            observation[key] = {"objects": list(dict.fromkeys(objects))}
-        elif key.startswith(IMAGES):
-            observation[key] = {"camera": key.removeprefix(IMAGES), "size": features[key]["shape"][:2]}
-        else:
-            raise CommandError(f"the policy uses {key}, which is not served", code="unknown_input")
-    config: dict[str, Any] = {"rate_hz": info["fps"], "observation": observation}
-    config |= {"action": actions[0]} if "" in arms else {"arms": actions}
-    joints = [name for name in names if name.rpartition(".")[2] != GRIPPER]
-    return {"joints": joints, "robot_type": info.get("robot_type"), "policy_config": config}
+    return arms
+
+
+def _describe_input(key: str, features: Mapping[str, Any], state: list[str]) -> dict[str, Any]:
+    """Return the entry of a policy configuration for one of the policy's features. Raises CommandError."""
+    if key == STATE:
+        return {"state": state}
+    if key == ENVIRONMENT and key in features:
+        return {"objects": list(dict.fromkeys(name.rpartition(".")[0] for name in features[key]["names"]))}
+    if key.startswith(IMAGES):
+        return {"camera": key.removeprefix(IMAGES), "size": features[key]["shape"][:2]}
+    raise CommandError(f"the policy uses {key}, which is not served", code="unknown_input")
 
 
 class LeRobotPolicy:

@@ -121,7 +121,7 @@ def lines(count: int = 200, engine: str = "pybullet", seed: int = 1, controller:
             goal = random_goal(numbers, start)
             planner = arm._planner()
             try:
-                (section,) = planner.along_poses(q, [goal]).sections
+                (section,) = planner.plan_poses(q, [goal]).sections
                 pose, terms = hal.Pose(goal[:3], goal[3:]), {"speed": 1.0, "tcp_speed": TCP_SPEED}
                 motion = arm.start_move_to(pose, straight=True, controller=controller, **terms)
             except (hal.Unreachable, hal.CollisionError):
@@ -190,7 +190,7 @@ def checks(count: int = 1000, seed: int = 1) -> dict[str, Any]:
         goal = random_goal(numbers, start)
         before = time.perf_counter()
         try:
-            plan = planner.along_poses(q, [goal])
+            plan = planner.plan_poses(q, [goal])
         except hal.Unreachable as error:
             times.append(time.perf_counter() - before)
             refused += 1
@@ -214,7 +214,7 @@ def checks(count: int = 1000, seed: int = 1) -> dict[str, Any]:
 def possible(planner: PathPlanner, q: Array, goal: list[float]) -> bool:
     """Return whether a line can be followed; one that needs too many knots to be sent can."""
     try:
-        planner.along_poses(q.tolist(), [goal])
+        planner.plan_poses(q.tolist(), [goal])
     except hal.Unreachable:
         return False
     except hal.CommandError:

@@ -142,11 +142,15 @@ def gentle_grasps(engine: str, thing: str, tries: int, seed: int = 0) -> list[st
     return ends
 
 
-def pushes(engine: str, thing: str, tries: int, seed: int = 0) -> list[str]:
-    """Return how each try of a push to a goal ended: empty for a success, else the reason, or ``off``."""
+def pushes(engine: str, thing: str, tries: int, seed: int = 0, friction: float = 1.0) -> list[str]:
+    """Return how each try of a push to a goal ended: empty for a success, else the reason, or ``off``.
+
+    ``friction`` is that of the table.
+    """
     random, ends = np.random.default_rng(seed), []
     with opened(engine, thing) as rig:
         arm = rig.robots["panda"]
+        rig.world.set_dynamics("table", lateral_friction=friction)
         locate = partial(locate_by_truth, rig, arm, thing)
         for _ in range(tries):
             start = scatter(rig, thing, random, PUSH_UPPER)
@@ -168,6 +172,7 @@ def rows() -> Iterator[tuple[str, Callable[[str, int], list[str]]]]:
     yield "gentle grasp cube", lambda engine, tries: gentle_grasps(engine, "cube", tries)
     for thing in ("cube", "cylinder"):
         yield f"push {thing}", lambda engine, tries, thing=thing: pushes(engine, thing, tries)
+    yield "push cube, table friction 0.1", lambda engine, tries: pushes(engine, "cube", tries, friction=0.1)
 
 
 def run(quick: bool) -> Iterator[Table]:

@@ -81,15 +81,8 @@ class Control:
         goal: tuple[float, ...] | None = None,
         path: tuple[PathSection, ...] | None = None,
     ) -> None:
-        check_deadman(deadman)
+        _check_permission(robot, deadman, unattended)
         spec = robot.spec
-        if spec.attended and deadman is None and not unattended:
-            raise CommandError(
-                f"{robot.name} really moves: pass deadman=pad.hold('l2'), or unattended=True if no person is near it",
-                code="deadman_required",
-            )
-        if deadman is not None and spec.attended and not spec.emulated:
-            deadman.check_trust()
         rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
         self._rate_hz = rate_hz
         self._deadline = max(_SHORTEST_DEADLINE, _PERIODS / rate_hz)
@@ -101,14 +94,12 @@ class Control:
             )
         self.robot = robot
         self.deadman = deadman
-        if streams:
-            self.speed = _share("speed", speed, spec.speed, spec.speed)
-        else:
-            self.speed = _share("speed", speed, spec.move_speed, 1.0)
-            if robot.recorded and self.speed > spec.speed:
-                text = f"{robot.name} is recorded: its speed is {spec.speed:g} and not {self.speed:g}, so that a replay"
-                warnings.warn(f"{text}, which may be no faster, can follow", RuntimeWarning, stacklevel=5)
-                self.speed = spec.speed
+        usual, most = (spec.speed, spec.speed) if streams else (spec.move_speed, 1.0)
+        self.speed = _share("speed", speed, usual, most)
+        if not streams and robot.recorded and self.speed > spec.speed:
+            text = f"{robot.name} is recorded: its speed is {spec.speed:g} and not {self.speed:g}, so that a replay"
+            warnings.warn(f"{text}, which may be no faster, can follow", RuntimeWarning, stacklevel=5)
+            self.speed = spec.speed
         self.tcp_speed = _share("tcp_speed", tcp_speed, spec.tcp_speed, spec.tcp_speed)
         self._goal, self._path = goal, path
         self._mail = robot._mail
@@ -342,9 +333,8 @@ class Control:
         """
         self._require_open()
         t_event = 0.0 if t_event is None or t_event == -math.inf else number("t_event", t_event, "s")
-        servo = self._peek()
-        now = self.robot.clock.now()
-        self._check_trip(servo, now)
+        servo, now = self._peek(), self.robot.clock.now()
+        self._check_trip(servo)
         waiting = self.deadman is not None and not self.deadman.held
         reasons: list[str] = []
         if servo.limited and servo.status is RobotStatus.FOLLOWING:
@@ -357,26 +347,33 @@ class Control:
             )
         target = self._finger_target(grip, width, force)
         if command is not None:
-            if self._goal is not None or self._path is not None:
-                raise CommandError("this session makes one motion; it takes no commands", code="move_to_session")
-            command = self._checks.checked(command, now, reasons)
-            if isinstance(command, JointTorque) and self._law:
-                raise CommandError("this session has a controller: it takes no torques", code="torques_by_controller")
-            self._check_time(now)
-            if waiting:
-                reasons.append("the dead-man is not held: the arm does not move")
-            elif servo.status is RobotStatus.HOLDING:
-                self._checks.check_first(command, now, servo.q_set)
-            kind, values = encode(command, now)
-            deadline = float(command.t[-1]) if isinstance(command, JointChunk) else now + self._deadline
-            with self._lock:
-                self.robot._commands += 1
-                record = CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event)
-                self._mail.put_command(record)
+            command = self._send_command(command, servo, now, t_event, waiting, reasons)
         if target is not None:
             with self._lock:
                 self._send_fingers(target, waiting, reasons)
         return Sent(command, tuple(reasons))
+
+    def _send_command(
+        self, command: Command, servo: ServoRecord, now: float, t_event: float, waiting: bool, reasons: list[str]
+    ) -> Command:
+        """Send a command to the servo, checked before; return what was sent."""
+        if self._goal is not None or self._path is not None:
+            raise CommandError("this session makes one motion; it takes no commands", code="move_to_session")
+        command = self._checks.checked(command, now, reasons)
+        if isinstance(command, JointTorque) and self._law:
+            raise CommandError("this session has a controller: it takes no torques", code="torques_by_controller")
+        self._check_time(now)
+        if waiting:
+            reasons.append("the dead-man is not held: the arm does not move")
+        elif servo.status is RobotStatus.HOLDING:
+            self._checks.check_first(command, now, servo.q_set)
+        kind, values = encode(command, now)
+        deadline = float(command.t[-1]) if isinstance(command, JointChunk) else now + self._deadline
+        with self._lock:
+            self.robot._commands += 1
+            record = CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event)
+            self._mail.put_command(record)
+        return command
 
     def hold_until_following(self) -> bool:
         """Return whether the arm follows commands; if not, command it to stay where it is. Call it once per turn.
@@ -412,7 +409,7 @@ class Control:
                 code="no_time_passed",
             )
 
-    def _check_trip(self, servo: ServoRecord, now: float) -> None:
+    def _check_trip(self, servo: ServoRecord) -> None:
         """Raise RobotFault or MotionStopped if the servo has latched a stop that it still holds.
 
         Raises:
@@ -509,6 +506,19 @@ class Control:
 def _share(name: str, value: float | None, default: float, most: float) -> float:
     """Return ``value`` or the default, checked against the most that the rig allows."""
     return number(name, default if value is None else value, least=0.0, above=True, most=most)
+
+
+def _check_permission(robot: Robot, deadman: Deadman | None, unattended: bool) -> None:
+    """Raise CommandError unless a dead-man that can be trusted permits what really moves, or nobody is near it."""
+    check_deadman(deadman)
+    spec = robot.spec
+    if spec.attended and deadman is None and not unattended:
+        raise CommandError(
+            f"{robot.name} really moves: pass deadman=pad.hold('l2'), or unattended=True if no person is near it",
+            code="deadman_required",
+        )
+    if deadman is not None and spec.attended and not spec.emulated:
+        deadman.check_trust()
 
 
 def check_deadman(deadman: object) -> None:

@@ -119,7 +119,7 @@ class Gripper:
     def states(self, after: float) -> list[GripperState]:
         """Return all states of the last second that are newer than ``after`` (s on ``rig.clock``), oldest first."""
         self.check()
-        return self._mail.history.since(after)
+        return self._mail.history.read_since(after)
 
     @property
     def trouble(self) -> str:

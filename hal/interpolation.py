@@ -80,7 +80,7 @@ def gripper_at(history: History[GripperState], t: float, name: str) -> GripperSt
 
 def _neighbours(history: History[AnyState], t: float, name: str) -> tuple[AnyState, AnyState, float]:
     """Return the states before and after ``t``, and the position of ``t`` between them, 0..1."""
-    found = history.around(t)
+    found = history.find_around(t)
     if found is None:
         raise StaleStateError(f"{name}: its state of {t:.3f} s is not known, or not any more")
     before, after = found

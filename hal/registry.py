@@ -45,9 +45,9 @@ __all__ = [
     "versions",
 ]
 
-PadInput = Literal["plugged", "console", "keys", "recording"]
-"""Source of a gamepad's input: a pad that is plugged in, the console's page, the keys of the terminal, or a recording.
-"""
+PadInput = Literal["plugged", "console", "keys", "recording", "program"]
+"""Source of a gamepad's input: a pad that is plugged in, the console's page, the keys of the terminal, a recording, or
+the program itself."""
 
 GROUP = "hal.drivers"
 """Group of the entry points."""

@@ -21,7 +21,7 @@ from .commands import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
-from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, groups_of
+from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups
 from .host.process import SharedMemory
 from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad
@@ -145,7 +145,7 @@ class Rig:
     def _open(self, *, pad: str | None, viewer: str, console: bool, listen: Listen, realtime: bool) -> None:
         plan = self.plan
         pads = check_opening(plan, pad, viewer, console)
-        groups = groups_of(plan)
+        groups = make_groups(plan)
         world_host = self._start_hosts(groups, realtime)
         if console or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)
@@ -153,13 +153,7 @@ class Rig:
             self._open_world_views(world_host, viewer)
         if viewer == "3d":
             self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
-        refused = False
-        for host in self._hosts:
-            if isinstance(host, RemoteHost):
-                ready = host.wait_ready()
-                refused |= realtime and bool(host.spec.robots) and not self.lock_step and not ready["realtime"]
-        if refused:
-            self._note_refused_priority()
+        self._wait_for_hosts(realtime)
         if world_host is not None:
             self.world = World(world_host.request, partial(self._world_edited, world_host))
         for host in self._hosts:
@@ -180,7 +174,11 @@ class Rig:
         for host in self._hosts:
             host.request("reset_statistics")  # leave out the start
 
-    def _note_refused_priority(self) -> None:
+    def _wait_for_hosts(self, realtime: bool) -> None:
+        """Wait until every process is ready, and note if an arm's did not get the real-time priority it asked for."""
+        ready = [(host.wait_ready(), host.spec.robots) for host in self._hosts if isinstance(host, RemoteHost)]
+        if not realtime or self.lock_step or all(answer["realtime"] or not robots for answer, robots in ready):
+            return
         from .preflight import REALTIME_RIGHT
 
         checked = self.attended and not self.emulated  # the check before a real arm has printed the command
@@ -320,15 +318,19 @@ class Rig:
         return host
 
     def driver(self, name: str) -> Any:
-        """Return the driver object of a device, in lock-step only; for tests that press a mock pad or read its log.
+        """Return the driver object of a device; for tests that press a mock pad or read its log.
+
+        In real time only those of pads and cameras are in this process.
 
         Args:
             name: Name of a robot, a camera or a pad, or ``NAME.gripper`` for a robot's gripper.
 
         Raises:
             DeviceNotFound: No such device.
-            NotSupported: In real time, where drivers are in processes of their own.
+            NotSupported: In real time, for a robot or a gripper, whose drivers are in processes of their own.
         """
+        if name in self._devices:
+            return self._devices[name]
         cycle = self._local.cycle
         drivers: dict[str, Any] = {unit_name: unit.driver for unit_name, unit in cycle.arms.items()}
         drivers |= {unit_name: unit.driver for unit_name, unit in cycle.grippers.items()}

@@ -213,7 +213,7 @@ class Robot:
         The last second is kept: in real time one state per cycle, in lock-step one per wait of the program.
         """
         self._host.check()
-        return self._mail.history.since(after)
+        return self._mail.history.read_since(after)
 
     def check(self) -> None:
         """Raise ConnectionLost if the process that owns the arm is gone; the arm cannot come back then."""
@@ -418,7 +418,7 @@ class Robot:
             return self._along([tcp_pose("a straight motion's target", target)], 0.0, terms)
         if not isinstance(target, Pose) and (points := _waypoints(target)) is not None:
             goals = [self._goal(point) for point in points]
-            return self._following(self._planner().along_joints(self._start_position(), goals), terms)
+            return self._following(self._planner().plan_joints(self._start_position(), goals), terms)
         assert target is not None
         goal = self._goal(target)
         self._check_collisions(np.array([self.state().q, goal]))
@@ -433,7 +433,7 @@ class Robot:
 
     def _along(self, poses: Sequence[Pose], blend: float, terms: dict[str, Any]) -> ArmMotion:
         values = [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in poses]
-        return self._following(self._planner().along_poses(self._start_position(), values, blend), terms)
+        return self._following(self._planner().plan_poses(self._start_position(), values, blend), terms)
 
     def _following(self, plan: MotionPlan, terms: dict[str, Any]) -> ArmMotion:
         if plan.sections:

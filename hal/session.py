@@ -94,8 +94,8 @@ class TeleopSession:
     * follows the gizmo of the 3D view while the sticks are at rest;
     * applies the settings that a page of the console changes, if ``adjustable``.
 
-    Everything runs in the thread that calls :meth:`run`, callbacks included. Nothing is printed: events go to
-    ``on_event`` and, as text, to the pages of the console.
+    Nothing moves before :meth:`run`. Everything runs in the thread that calls it, callbacks included. Nothing is
+    printed: events go to ``on_event`` and, as text, to the pages of the console.
 
     Example:
         Drive the first arm of a rig with its first pad until Ctrl-C::
@@ -104,6 +104,26 @@ class TeleopSession:
                 session = hal.TeleopSession(rig, on_event=lambda event: print(event.text))
                 print(session.help())
                 session.run()
+
+    Args:
+        rig: Open rig.
+        robot: Arm to drive, or several; None for the rig's first one.
+        pad: Gamepad that drives it, or several; None for as many of the rig's as there are arms. A pad drives the
+            arm that its entry in the rig names (``drives``), else the next one; a single pad drives one after
+            the other.
+        independent: Whether an arm that stops leaves the others moving.
+        mapping: Name or file of the teleoperation mapping; None for the one that the plugged-in pad is meant for.
+        speed: Share of the mapping's speeds, above 0, at most 1. The console cannot exceed it.
+        actions: Actions of the mapping (``record``, ``finish``, ...) that the program handles, for the labels on
+            the console.
+        adjustable: Whether a page of the console may choose the arm, the speed and the frame, and reset a
+            simulated scene.
+        on_event: Called with every :class:`SessionEvent`.
+        on_tick: Called after every command, with :attr:`state` updated.
+
+    Raises:
+        CommandError: The rig has no robot or no gamepad.
+        ConfigError: The mapping is wrong.
     """
 
     def __init__(
@@ -120,28 +140,6 @@ class TeleopSession:
         on_event: Callable[[SessionEvent], None] | None = None,
         on_tick: Callable[[], None] | None = None,
     ) -> None:
-        """Prepare a session; nothing moves before :meth:`run`.
-
-        Args:
-            rig: Open rig.
-            robot: Arm to drive, or several; None for the rig's first one.
-            pad: Gamepad that drives it, or several; None for as many of the rig's as there are arms. A pad drives the
-                arm that its entry in the rig names (``drives``), else the next one; a single pad drives one after
-                the other.
-            independent: Whether an arm that stops leaves the others moving.
-            mapping: Name or file of the teleoperation mapping; None for the one that the plugged-in pad is meant for.
-            speed: Share of the mapping's speeds, above 0, at most 1. The console cannot exceed it.
-            actions: Actions of the mapping (``record``, ``finish``, ...) that the program handles, for the labels on
-                the console.
-            adjustable: Whether a page of the console may choose the arm, the speed and the frame, and reset a
-                simulated scene.
-            on_event: Called with every :class:`SessionEvent`.
-            on_tick: Called after every command, with :attr:`state` updated.
-
-        Raises:
-            CommandError: The rig has no robot or no gamepad.
-            ConfigError: The mapping is wrong.
-        """
         self.rig = rig
         robots = _listed(robot, list(rig.robots.values())[:1], f"{rig.plan.source} has no robot", "no_robot")
         missing = f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'"

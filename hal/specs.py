@@ -377,6 +377,8 @@ class PadSpec:
     drives: str | None = None
     """Arm that it drives where several are driven at once; None for the first that no other pad drives."""
     options: dict[str, Any] = field(default_factory=dict)
+    real: bool = False
+    """Whether a person must operate it, so that no recording is chosen for it."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any
 
 import can
 
-from hal.config.files import closest
+from hal.config.files import find_closest
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, DriverMissing, Fault, HalError, Problem
 
 from .settings import BusSettings
@@ -215,7 +215,7 @@ class CanBus:
         s = self.settings
         where = f"{s.interface} {s.channel}"
         if s.interface not in can.VALID_INTERFACES:
-            near = closest(s.interface, can.VALID_INTERFACES)
+            near = find_closest(s.interface, can.VALID_INTERFACES)
             hint = f"; did you mean {near!r}?" if near else ""
             message = f"there is no interface {s.interface!r} in python-can{hint}"
             return ConfigError([Problem("<rig>", "real.interface", message, "unknown_interface")])

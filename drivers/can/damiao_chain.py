@@ -11,7 +11,7 @@ without one it damps, and what it carries sinks.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any
 
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalError, Problem
@@ -161,28 +161,31 @@ class DamiaoChain:
     def _read_registers(self, bus: CanBus) -> None:
         """Read the registers and the state of every motor, several at a time."""
         began = time.monotonic()
-        while True:
-            left = [motor for motor in self.motors if self._ask_register(bus, motor)]
-            waiting = [motor for motor in self.motors if motor not in left and not motor.replies]
-            for motor in waiting:
-                bus.send(REGISTER_ID, motor.state_request)
-            if not left and not waiting:
-                break
+        while asked := [motor for motor in self.motors if self._ask_unknown(bus, motor)]:
             elapsed = time.monotonic() - began
             silent = [motor for motor in self.motors if not motor.registers]
             if elapsed > _OPENING or (silent and elapsed > _FIRST_ANSWER):
-                raise self._not_found(bus, silent or left or waiting)
-            known = sum(len(motor.registers) + bool(motor.replies) for motor in self.motors)
-            until = time.monotonic() + _ROUND
-            while time.monotonic() < until:
+                raise self._not_found(bus, silent or asked)
+            expected, until = self._count_answers() + len(asked), time.monotonic() + _ROUND
+            while time.monotonic() < until and self._count_answers() < expected:
                 if not bus.poll():
                     raise bus.error(self.name)
-                if sum(len(m.registers) + bool(m.replies) for m in self.motors) - known >= len(left) + len(waiting):
-                    break
                 time.sleep(2e-4)
         for motor in self.motors:
             motor.decode()
             motor.replies = 0
+
+    def _count_answers(self) -> int:
+        """Return the number of registers and states that are known while the chain is opened."""
+        return sum(len(motor.registers) + bool(motor.replies) for motor in self.motors)
+
+    def _ask_unknown(self, bus: CanBus, motor: ChainMotor) -> bool:
+        """Ask a motor for its next register, then for its state; return whether one of them is not known."""
+        if self._ask_register(bus, motor):
+            return True
+        if not motor.replies:
+            bus.send(REGISTER_ID, motor.state_request)
+        return not motor.replies
 
     def _ask_register(self, bus: CanBus, motor: ChainMotor) -> bool:
         """Ask a motor for the next register that is not known; return whether there is one."""
@@ -258,46 +261,47 @@ class DamiaoChain:
             self._count_loss()
             self.lost = bus.error(self.name)
             return
-        complete = True
-        silent: list[ChainMotor] = []
-        for motor in self.motors:
-            count, asked = motor.replies, motor.asked
-            motor.replies = motor.asked = 0
-            if count:
-                motor.decode()
-                motor.silent = 0
-                motor.t = self._t_asked
-                if motor.on and motor.status != 1 and now - motor.switched_at > SWITCHING:
-                    motor.on = False
-                    if motor.status == 0:
-                        motor.registers.clear()  # it was switched off and on again
-            if count > asked:
-                late = min(count - asked, motor.gap)
-                motor.late += late
-                motor.gap = 0
-                if count - asked > late:
-                    self._note_unasked(motor, count - asked - late)
-            elif count < asked:
-                motor.missing += asked - count
-                motor.gap += asked - count
-                if not count:
-                    complete = False
-                    if not motor.silent:
-                        motor.silent_since = self._t_asked
-                    motor.silent += 1
-                    if motor.silent >= _UNANSWERED and now - motor.silent_since > SILENCE:
-                        motor.on = False
-                        motor.registers.clear()  # it may come back as another one
-                        silent.append(motor)
         if self._asked:
             self._asked = False
             self.cycles += 1
-            self.incomplete += not complete
+            self.incomplete += any(motor.asked and not motor.replies for motor in self.motors)
+        silent = [motor for motor in self.motors if self._take_replies(motor)]
         if silent:
             self._count_loss()
             self.lost = self._silence_error(silent)
         elif self.lost is not None:
             self._check_return()
+
+    def _take_replies(self, motor: ChainMotor) -> bool:
+        """Take what a motor has answered since the last update; return whether it counts as lost."""
+        count, surplus = motor.replies, motor.replies - motor.asked
+        motor.replies = motor.asked = 0
+        if count:
+            motor.decode()
+            motor.silent = 0
+            motor.t = self._t_asked
+            if motor.on and motor.status != 1 and self._now - motor.switched_at > SWITCHING:
+                motor.on = False
+                if motor.status == 0:
+                    motor.registers.clear()  # it was switched off and on again
+        if surplus > 0:
+            late = min(surplus, motor.gap)
+            motor.late += late
+            motor.gap = 0
+            if surplus > late:
+                self._note_unasked(motor, surplus - late)
+        elif surplus < 0:
+            motor.missing -= surplus
+            motor.gap -= surplus
+            if not count:
+                if not motor.silent:
+                    motor.silent_since = self._t_asked
+                motor.silent += 1
+                if motor.silent >= _UNANSWERED and self._now - motor.silent_since > SILENCE:
+                    motor.on = False
+                    motor.registers.clear()  # it may come back as another one
+                    return True
+        return False
 
     def _note_unasked(self, motor: ChainMotor, count: int) -> None:
         """Count answers that nothing here asked for. Own frames that come back are none: they have other ids."""
@@ -353,23 +357,19 @@ class DamiaoChain:
 
     def send(self, motor: ChainMotor, data: bytes) -> None:
         """Send a command to a motor. Raises ConnectionLost."""
-        bus = self.bus
-        if bus is None:
-            raise ConnectionLost(f"{self.name} is not open", code="closed")
-        motor.asked += 1
-        self._asked = True
-        self._t_asked = self._now
-        bus.send(motor.id, data)
+        self._send(motor, motor.id, data)
 
     def ask_state(self, motor: ChainMotor) -> None:
         """Ask a motor for its state, which changes nothing. Raises ConnectionLost."""
-        bus = self.bus
-        if bus is None:
+        self._send(motor, REGISTER_ID, motor.state_request)
+
+    def _send(self, motor: ChainMotor, id: int, data: bytes) -> None:
+        if self.bus is None:
             raise ConnectionLost(f"{self.name} is not open", code="closed")
         motor.asked += 1
         self._asked = True
         self._t_asked = self._now
-        bus.send(REGISTER_ID, motor.state_request)
+        self.bus.send(id, data)
 
     # Faults.
 
@@ -442,42 +442,42 @@ class DamiaoChain:
         if bus is None or not on:
             return
         try:
-            deadline = time.monotonic() + _LOWERING
-            at, since = self._positions(), time.monotonic()
-            carried = True
-            heard: set[int] = set()  # since then: a motor that does not answer is not known to rest
-            while (now := time.monotonic()) < deadline:
-                q = self._positions()
-                if any(abs(q[k] - at[k]) > _AT_REST for k in on):
-                    at, since, carried = q, now, True
-                    heard.clear()
-                if now - since > _REST and heard.issuperset(on):
-                    if not carried or weight is None:
-                        break
-                    since, carried = now, False
-                    heard.clear()
-                tau = weight(q) if weight is not None and carried else (0.0,) * len(q)
-                for k in on:
-                    motor = self.motors[k]
-                    free = _SINKING * motor.kd
-                    held = tau[k] - min(max(tau[k], -free), free)
-                    self.send(motor, motor.command(motor.q, 0.0, 0.0, motor.kd, held))
-                yield False
-                if not bus.poll():
-                    return
-                for k, motor in enumerate(self.motors):
-                    if motor.replies:
-                        motor.decode()
-                        motor.replies = 0
-                        heard.add(k)
-            else:
-                return
-            for _ in range(2):  # one may be lost
-                for k in on:
-                    self.send(self.motors[k], DISABLE)
-                yield False
+            if (yield from self._sink(bus, on, weight)):
+                for _ in range(2):  # one may be lost
+                    for k in on:
+                        self.send(self.motors[k], DISABLE)
+                    yield False
         except HalError:
             return  # the motors damp by themselves after TIMEOUT
+
+    def _sink(self, bus: CanBus, on: list[int], weight: Weight | None) -> Generator[bool, None, bool]:
+        """Let the motors ``on`` sink, and yield False after each step; return whether they rest without help."""
+        deadline = time.monotonic() + _LOWERING
+        at, since, carried = self._positions(), time.monotonic(), True
+        heard: set[int] = set()  # since then: a motor that does not answer is not known to rest
+        while (now := time.monotonic()) < deadline:
+            q = self._positions()
+            if any(abs(q[k] - at[k]) > _AT_REST for k in on):
+                at, since, carried, heard = q, now, True, set()
+            elif now - since > _REST and heard.issuperset(on):
+                if not carried or weight is None:
+                    return True
+                since, carried, heard = now, False, set()
+            tau = weight(q) if weight is not None and carried else (0.0,) * len(q)
+            for k in on:
+                motor = self.motors[k]
+                free = _SINKING * motor.kd
+                held = tau[k] - min(max(tau[k], -free), free)
+                self.send(motor, motor.command(motor.q, 0.0, 0.0, motor.kd, held))
+            yield False
+            if not bus.poll():
+                return False
+            for k, motor in enumerate(self.motors):
+                if motor.replies:
+                    motor.decode()
+                    motor.replies = 0
+                    heard.add(k)
+        return False
 
     def _positions(self) -> list[float]:
         return [motor.q for motor in self.motors]

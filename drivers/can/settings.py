@@ -15,7 +15,7 @@ from zlib import crc32
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
-from hal.config.files import Problems, closest, validate
+from hal.config.files import Problems, find_closest, validate
 from hal.config.schema import Flag, Quantity, Size, Strict, describe, is_number
 from hal.kinematics.inertials import find_wrong_inertials
 from hal.specs import GripperSpec, RobotSpec
@@ -111,7 +111,7 @@ def _direction(value: Any) -> float:
 def _motor_type(value: Any) -> str:
     if isinstance(value, str) and value in MOTOR_RANGES:
         return value
-    near = closest(value.upper(), MOTOR_RANGES) if isinstance(value, str) else None
+    near = find_closest(value.upper(), MOTOR_RANGES) if isinstance(value, str) else None
     hint = f"; did you mean {near!r}?" if near else ""
     raise ValueError(f"there is no motor type {describe(value)}{hint}; types: {', '.join(MOTOR_RANGES)}")
 

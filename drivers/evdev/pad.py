@@ -15,7 +15,7 @@ from hal.config.files import Problems
 from hal.config.models import load_pad_models
 from hal.driver import GamepadDriver, PadReading, Plugged
 from hal.errors import NotSupported
-from hal.pads.model import PadModel, choose_model, guess_model, guess_warning, pad_model, validated
+from hal.pads.model import PadModel, check_record, choose_model, guess_model, guess_warning, pad_model
 from hal.specs import PadSpec
 from hal.types import AXES
 
@@ -51,7 +51,7 @@ class EvdevPad(GamepadDriver):
     def __init__(self, spec: PadSpec, source: object | None = None, *, system: InputSystem | None = None) -> None:
         super().__init__(spec, source)
         place = f"gamepads.{spec.name}"
-        self._options = validated(EvdevOptions, spec.options, place)
+        self._options = check_record(EvdevOptions, spec.options, place)
         chosen = (spec.model,) if spec.model is not None else spec.models
         self._models = tuple(pad_model(data, f"{place}, model {data.get('name')}") for data in chosen)
         self._finder: DeviceFinder | None = DeviceFinder(system, watched=False) if system is not None else None

@@ -15,5 +15,7 @@ DRIVER = DriverSpec(
     gripper="hal.drivers.mock.robot:MockGripper",
     camera="hal.drivers.mock.camera:MockCamera",
     gamepad="hal.drivers.mock.gamepad:MockPad",
+    pad_input="program",
+    pad_title="the program",
     stands_in=True,
 )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.drivers.scene.engine import RayFound
+from hal.drivers.scene.values import BOUNCE
 
 from .engine import Body, LinkContact
 
@@ -36,11 +37,13 @@ HARD_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 """How much of a contact's ideal force acts: little of it is lost, so that fingers do not sink into what they hold."""
 PAD_IMPEDANCE = (0.99, 0.999, 0.001, 0.5, 2.0)
 """The same between a gripper's pad and what it holds."""
+BOUNCING_IMPEDANCE = (0.999, 0.999, 0.001, 0.5, 2.0)
+"""The same of a contact with restitution."""
 CARRIED = 5
 """Group of the shapes of objects that are attached to an arm, which rays pass through."""
 REACH = 1e4
 """Largest distance between two bodies that is computed, m."""
-SOFTEST = 0.1
+SOFTEST = 0.02
 """Least ratio of the force that acts to that which is lost, for contacts with a stiffness."""
 
 
@@ -85,26 +88,35 @@ def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactPa
 
 
 def add_pairs(spec: Any, bodies: Collection[Body]) -> None:
-    """Add to a ``mujoco.MjSpec`` the pairs of shapes of :func:`friction_pairs`, in place of those from before."""
+    """Add to a ``mujoco.MjSpec`` the pairs of shapes of :func:`friction_pairs`, in place of those from before.
+
+    MuJoCo has no restitution. But a contact's damping times the step is the share of the speed that it takes in a step,
+    so that (1 + e) / h, without a spring that adds to it, sends bodies back with e times their speed.
+    """
     for pair in spec.pairs:
         spec.delete(pair)
-    for a, k, b, m, friction in friction_pairs(bodies):
+    h = spec.option.timestep
+    for a, k, b, m, friction, bounce in friction_pairs(bodies):
         one, other = spec.geom(f"{a.link_path(k)}/0"), spec.geom(f"{b.link_path(m)}/0")
         first = max((one, other), key=lambda shape: (shape.priority, shape.solmix))
         spin, roll = (max(one.friction[place], other.friction[place]) for place in (1, 2))
+        solref, solimp = first.solref, first.solimp
+        if bounce > 0.0:
+            solref, solimp = (-BOUNCE / h**2, -(1.0 + bounce) / h), BOUNCING_IMPEDANCE
         for first_shape, second_shape in itertools.product(range(a.solids[k]), range(b.solids[m])):
             spec.add_pair(
                 geomname1=f"{a.link_path(k)}/{first_shape}",
                 geomname2=f"{b.link_path(m)}/{second_shape}",
                 friction=(friction, friction, spin, roll, roll),
                 condim=max(one.condim, other.condim),
-                solref=first.solref,
-                solimp=first.solimp,
+                solref=solref,
+                solimp=solimp,
+                solreffriction=HARD_CONTACT if bounce > 0.0 else (0.0, 0.0),
             )
 
 
-def friction_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, int, float]]:
-    """Yield the links (body and number of each) between which MuJoCo's own friction is wrong, with the right one."""
+def friction_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, int, float, float]]:
+    """Yield the links (body and number of each) whose contacts are not MuJoCo's own, with friction and restitution."""
     for a, b in itertools.combinations(bodies, 2):
         if a.carried or b.carried or not (a.floating or a.movable or b.floating or b.movable):
             continue
@@ -113,13 +125,14 @@ def friction_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, 
             if not (a.solids[k] and b.solids[m]) or k in skip_a or m in skip_b:
                 continue
             soft_one, soft_other = one.contact_stiffness is not None, other.contact_stiffness is not None
+            bounce = 0.0 if soft_one or soft_other else one.restitution * other.restitution
             if soft_one == soft_other:
                 used = max(one.lateral_friction, other.lateral_friction)
             else:
                 used = (one if soft_one else other).lateral_friction
             right = one.lateral_friction * other.lateral_friction
-            if abs(USUAL_FRICTION * used - right) > 1e-9:
-                yield a, k, b, m, right
+            if abs(USUAL_FRICTION * used - right) > 1e-9 or bounce > 0.0:
+                yield a, k, b, m, right, bounce
 
 
 def find_contacts(

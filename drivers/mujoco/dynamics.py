@@ -10,7 +10,8 @@ from .engine import Body
 
 __all__ = ["read_dynamics", "write_dynamics"]
 
-_CONTACT = ("lateral_friction", "rolling_friction", "spinning_friction", "contact_stiffness", "contact_damping")
+_FRICTIONS = ("lateral_friction", "rolling_friction", "spinning_friction")
+_CONTACT = (*_FRICTIONS, "restitution", "contact_stiffness", "contact_damping")
 
 
 def read_dynamics(model: Any, body: Body, link: int) -> dict[str, Any]:

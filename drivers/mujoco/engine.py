@@ -43,6 +43,7 @@ class LinkContact:
     lateral_friction: float = 0.5
     rolling_friction: float = 0.0
     spinning_friction: float = 0.0
+    restitution: float = 0.0
     contact_stiffness: float | None = None
     """N/m; None where contacts are as hard as the step allows."""
     contact_damping: float | None = None

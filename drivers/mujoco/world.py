@@ -53,7 +53,6 @@ class MujocoWorld(SimulatedWorld[Body]):
 
     ENGINE = "MuJoCo"
     UNSUPPORTED: ClassVar[Mapping[str, str]] = {
-        "restitution": "set contact_stiffness and contact_damping, which let a contact bounce",
         "linear_damping": "leave it out: bodies move without air resistance",
         "angular_damping": "leave it out: bodies turn without air resistance",
     }

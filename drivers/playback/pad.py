@@ -27,7 +27,7 @@ from hal.driver import GamepadDriver, PadReading
 from hal.errors import ConfigError, ConnectionLost, Problem
 from hal.pads.codes import ABS, ABS_NAME, EV_ABS, EV_KEY, KEY, KEY_NAME
 from hal.pads.mapper import AxisRange, PadMapper
-from hal.pads.model import PadModel, pad_model, validated
+from hal.pads.model import PadModel, check_record, pad_model
 from hal.specs import PadSpec
 
 __all__ = ["PadRecording", "PlaybackPad", "RecordedEvent", "check", "dump_recording", "load_recording"]
@@ -75,7 +75,7 @@ class PlaybackPad(GamepadDriver):
         """World's time minus the clock's at the first poll, s."""
         self._behind = 0.0
         """How far the world has fallen behind the clock since then, s."""
-        self._options = validated(PlaybackOptions, spec.options, f"gamepads.{spec.name}")
+        self._options = check_record(PlaybackOptions, spec.options, f"gamepads.{spec.name}")
         self._recording = PadRecording("", {}, ())
         self._mapper: PadMapper | None = None
         self._t0: float | None = None

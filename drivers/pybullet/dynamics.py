@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from hal.drivers.scene.engine import AppliedForce, RayFound
+from hal.drivers.scene.values import BOUNCE
 from hal.geometry import compose
 
 from .engine import Body, PyBulletClient
@@ -39,6 +40,8 @@ _HARD = 1e9
 """Stiffness of a rigid contact, N/m."""
 _DEFAULT_ERP = 0.2
 """Share of a contact's depth that PyBullet takes away per step where no stiffness is set."""
+_ANY = 1e18
+"""Distance up to which PyBullet by default takes bodies that approach each other for a contact, m."""
 FAR = 1000.0
 """Distance from the origin where bodies touch nothing, m."""
 
@@ -91,18 +94,30 @@ def write_dynamics(
             body.weigh_fingers(client, body.handling)
     body.damping = (wanted.get(_DAMPING[0], body.damping[0]), wanted.get(_DAMPING[1], body.damping[1]))
 
-    if _CONTACT[0] not in wanted:
-        return
-    stiffness, damping = wanted["contact_stiffness"], wanted["contact_damping"]
+    if not {*_CONTACT, "restitution"}.isdisjoint(wanted):
+        _write_contact(client, body, link, {**before, **wanted}, dt)
+
+
+def _write_contact(client: PyBulletClient, body: Body, link: int, values: Mapping[str, Any], dt: float) -> None:
+    """Set how contacts give way and bounce.
+
+    PyBullet cannot forget a stiffness. A contact's error reduction is dt k / (dt k + d) and its softness
+    1 / (dt k + d), so a huge k with this d is the solver's own hard contact.
+
+    A contact that bounces must begin when bodies touch, and be hard with a small error reduction: PyBullet adds to the
+    speed after it what takes the depth away, and subtracts what closes a gap before it, up to a third of the height.
+    """
+    stiffness, bounces = values["contact_stiffness"], values["restitution"] > 0.0
     if stiffness is not None:
-        client.changeDynamics(body.id, link, contactStiffness=stiffness, contactDamping=damping)
+        client.changeDynamics(body.id, link, contactStiffness=stiffness, contactDamping=values["contact_damping"])
         body.hardened.discard(link)
-    elif before["contact_stiffness"] is not None:
-        # PyBullet cannot forget a stiffness. A contact's error reduction is dt k / (dt k + d) and its softness
-        # 1 / (dt k + d), so a huge k with this d is the solver's own hard contact.
-        damping = dt * _HARD * (1.0 / _DEFAULT_ERP - 1.0)
+    elif bounces or client.getDynamicsInfo(body.id, link)[9] >= 0.0:
+        reduction = 2.0 * BOUNCE if bounces else _DEFAULT_ERP  # between two that bounce, a quarter of it remains
+        damping = dt * _HARD * (1.0 / reduction - 1.0)
         client.changeDynamics(body.id, link, contactStiffness=_HARD, contactDamping=damping)
         body.hardened.add(link)
+    begin = 0.0 if bounces and stiffness is None else _ANY
+    client.changeDynamics(body.id, link, contactProcessingThreshold=begin)
 
 
 # --- contacts -------------------------------------------------------------------------------------------------------

@@ -199,8 +199,8 @@ class Body(SimulatedBody):
     """Greatest torque or force of each driven joint: Nm, or N."""
     speeds: dict[int, float] = field(default_factory=dict)
     """Greatest speed of each driven joint: rad/s, or m/s."""
-    damping: tuple[float, float] = (0.04, 0.04)
-    """Linear and angular damping. PyBullet does not report them; 0.04 is its default."""
+    damping: tuple[float, float] = (0.0, 0.0)
+    """Linear and angular damping, 1/s, which PyBullet does not report. Its own default of 0.04 is switched off."""
     gears: list[Gear] = field(default_factory=list)
     """Couplings between joints that move together (fingers)."""
     fingers: dict[int, tuple[Weight, Weight]] = field(default_factory=dict)

@@ -311,6 +311,7 @@ def _describe(
         elif info[2] != client.JOINT_FIXED:
             message = f"joint {info[1].decode()!r} is neither fixed, revolute, continuous nor prismatic"
             raise ConfigError([Problem(str(spec.urdf), key, message, "wrong_joint")])
+    client.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0)  # there is no air
     dynamics = client.getDynamicsInfo(number, -1)
     base: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     if isinstance(spec, BodySpec):

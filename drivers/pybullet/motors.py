@@ -29,9 +29,6 @@ GEAR_FORCE = 10.0
 CONSTRAINT_ERP = 0.2
 """PyBullet's own share, which it multiplies a gear's by."""
 
-_DRAG, _DRAG_OF_BULLET = 0.04, float(np.float32(0.04))
-"""PyBullet's default of the damping of bodies, and the number that it has for it."""
-
 
 def position_gain(dt: float) -> float:
     """Return the share of the position error that a motor takes away in one physics step of ``dt`` s."""
@@ -167,11 +164,10 @@ class JointTorques:
     PyBullet takes a torque for one step, so they must be applied again for each. The compensation covers gravity on
     everything that the joints move; an object in the gripper is not compensated.
 
-    While torques drive the arm, PyBullet's drag on all bodies does not act on it, and damping in the URDF is integrated
-    implicitly here: PyBullet takes it from the speed at the start of the step, which is unstable for a light wrist
-    (0.5 Nm s/rad on 0.001 kg m2 at 240 Hz). It follows from the speed that is expected at the end instead,
-    ``(M + dt D) v = M v0 + dt (tau - bias + external)``; contacts and loads are estimated from what the step before
-    changed unexpectedly.
+    While torques drive the arm, damping in the URDF is integrated implicitly here: PyBullet takes it from the speed at
+    the start of the step, which is unstable for a light wrist (0.5 Nm s/rad on 0.001 kg m2 at 240 Hz). It follows from
+    the speed that is expected at the end instead, ``(M + dt D) v = M v0 + dt (tau - bias + external)``; contacts and
+    loads are estimated from what the step before changed unexpectedly.
     """
 
     def __init__(self, client: PyBulletClient, body: Body, joints: Sequence[int], dt: float) -> None:
@@ -202,17 +198,28 @@ class JointTorques:
         """Estimated torques of contacts and loads, Nm."""
         self._v0 = self._mass = self._bias = np.zeros(0)
         """Of the present step: speeds at its start (n,), inertia (n, n), and gravity and Coriolis torques (n,)."""
+        self._handover: Array | float = 0.0
+        """Torques (n,) of the motors in the step in which they hand over, Nm."""
         self._driving = False
         self._reloads = body.reloads
         """That of the body to which the torques were added."""
 
-    def take_over(self) -> None:
-        """Switch the joints' own motors off, and start to apply torques."""
+    def take_over(self, dq: Floats) -> None:
+        """Switch the joints' own motors off, and start to apply torques.
+
+        PyBullet's solver stops before its motors have exactly the speed that they follow. In the first step they get
+        there, within their effort, so that an arm that was held does not drift away.
+
+        Args:
+            dq: Speeds (n,) that the motors follow, rad/s.
+        """
         self.switch_off()
         self._applied = self._sum = [0.0] * len(self._joints)
         self._external = np.zeros(len(self._joints))
         self._v0 = np.zeros(0)
         self.next_step()
+        q, now = self._state()
+        self._handover = self._model.inertia(q)[self._block] @ (np.array(dq) - now[self._places]) / self._dt
 
     def switch_off(self) -> None:
         """Switch the joints' own motors off."""
@@ -220,22 +227,19 @@ class JointTorques:
         client.setJointMotorControlArray(self._body.id, self._joints, client.VELOCITY_CONTROL, forces=nothing)
         if not self._driving:
             self._driving = True
-            self._set_damping([0.0] * len(self._joints), (0.0, 0.0))
+            self._set_damping([0.0] * len(self._joints))
 
     def end(self) -> None:
         """Let PyBullet damp the joints again, because their motors follow. Idempotent."""
         if self._driving:
             self._driving = False
-            damping = [0.0] * len(self._joints) if self._damping is None else self._damping.tolist()
-            drag = [_DRAG_OF_BULLET if value == _DRAG else value for value in self._body.damping]
-            self._set_damping(damping, drag)
+            if self._damping is not None:
+                self._set_damping(self._damping.tolist())
 
-    def _set_damping(self, damping: Floats, drag: Floats) -> None:
-        client, number = self._client, self._body.id
+    def _set_damping(self, damping: Floats) -> None:
         if self._damping is not None:
             for joint, value in zip(self._joints, damping, strict=True):
-                client.changeDynamics(number, joint, jointDamping=value)
-        client.changeDynamics(number, -1, linearDamping=drag[0], angularDamping=drag[1])
+                self._client.changeDynamics(self._body.id, joint, jointDamping=value)
 
     def next_step(self) -> None:
         """Start the next physics step, to which no torques are applied yet."""
@@ -248,6 +252,7 @@ class JointTorques:
         self._weigh(q, dq)
         self.last_applied, self._applied = self._applied, [0.0] * len(self._joints)
         self._sum = self._applied
+        self._handover = 0.0
 
     def _state(self) -> tuple[Array, Array]:
         q, dq, _, _ = zip(*self._client.getJointStates(self._body.id, self._model.movable), strict=True)
@@ -268,7 +273,7 @@ class JointTorques:
             self._weigh(*self._state())
         wanted = [
             max(-effort, min(effort, own + held))
-            for own, held, effort in zip(tau, self._gravity, self._efforts, strict=True)
+            for own, held, effort in zip(np.add(tau, self._handover), self._gravity, self._efforts, strict=True)
         ]
         total = wanted if self._damping is None else self._damped(wanted, self._damping)
         self._add([new - old for new, old in zip(total, self._sum, strict=True)])

@@ -83,7 +83,7 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
         hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)
 
     def _take_over(self) -> None:
-        self._torques.take_over()
+        self._torques.take_over([0.0] * len(self._joints) if self._dq is None else self._dq)
         self._t_applied = self._world.t
 
     def _apply(self, tau: Floats) -> None:

@@ -285,6 +285,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
         for body in bodies:
             new = self._place(body.spec)
             body.id, body.gears, body.hardened, body.fingers = new.id, new.gears, new.hardened, new.fingers
+            body.damping = new.damping
             body.handling, body.edits, body.reloads = True, body.edits + 1, body.reloads + 1
             for link, values in dynamics[body.name].items():
                 before = read_dynamics(client, body, link)

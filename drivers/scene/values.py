@@ -12,6 +12,7 @@ from hal.geometry import Transform
 from hal.specs import BodySpec, from_json
 
 __all__ = [
+    "BOUNCE",
     "DYNAMICS",
     "body_spec",
     "check_body",
@@ -28,6 +29,8 @@ __all__ = [
 
 SINKS = 1e-4
 """How deep a body sinks in by its weight with the stiffness that a message proposes, m."""
+BOUNCE = 0.01
+"""Share of its depth that a contact with restitution loses in a step: a greater one would add to the height."""
 _CONTACT = ("contact_stiffness", "contact_damping")
 DYNAMICS = (
     "mass",

@@ -8,7 +8,7 @@ from contextlib import suppress
 
 from hal.driver import GamepadDriver, PadReading
 from hal.pads.keyboard import keyboard_table
-from hal.pads.model import validated
+from hal.pads.model import check_record
 from hal.specs import PadSpec
 
 from .controls import HELP, RELEASED, STOP_KEYS, PadControls, StepControls, TerminalOptions
@@ -35,7 +35,7 @@ class TerminalPad(GamepadDriver):
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
-        self._options = validated(TerminalOptions, spec.options, f"gamepads.{spec.name}")
+        self._options = check_record(TerminalOptions, spec.options, f"gamepads.{spec.name}")
         self._terminal: Terminal | None = None
         self._parser = KeyParser()
         self._controls = StepControls(self._options, spec.dead_zone)

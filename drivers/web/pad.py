@@ -14,7 +14,7 @@ from hal import registry
 from hal.driver import GamepadDriver, PadReading
 from hal.errors import NotSupported
 from hal.gamepad import CONTROL_NAMES
-from hal.pads.choice import tour
+from hal.pads.choice import play_tour
 from hal.pads.keyboard import keyboard_table
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
@@ -160,7 +160,7 @@ class WebPad(GamepadDriver):
     # At both ends of the tour the pad is lost for a moment: nothing held on one pad moves the arm with the other.
 
     def _start_tour(self, now: float) -> PadReading:
-        recorded = tour(self.spec)
+        recorded = play_tour(self.spec)
         self._tour = registry.load(recorded.driver, "gamepad")(replace(recorded, name=self.spec.name), None)
         self._tour.open()
         self._stop_count = self._console.stop_count

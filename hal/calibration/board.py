@@ -85,7 +85,7 @@ class Board:
         """Centre (3,) in the board's frame, m."""
         return np.array([*self.size, 0.0]) / 2.0
 
-    def measured(self, square: float) -> Board:
+    def resize(self, square: float) -> Board:
         """Return the board as printed: with squares of ``square`` m, and the markers scaled with them."""
         if not 0.001 <= square <= 1.0:
             raise CommandError(
@@ -93,7 +93,7 @@ class Board:
             )
         return replace(self, square=square, marker=self.marker * square / self.square)
 
-    def for_opencv(self) -> Any:
+    def make_opencv(self) -> Any:
         """Return it as ``cv2.aruco.CharucoBoard``."""
         aruco = opencv().aruco
         markers = aruco.getPredefinedDictionary(getattr(aruco, self.dictionary))
@@ -138,7 +138,7 @@ class BoardConfig(Strict):
     dictionary: str = "DICT_4X4_50"
 
     @model_validator(mode="after")
-    def _marker_fits(self) -> BoardConfig:
+    def _check_marker(self) -> BoardConfig:
         if not self.marker < self.square:
             raise ValueProblem("marker must be smaller than square; both are in m", "out_of_range")
         return self

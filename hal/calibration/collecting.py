@@ -182,7 +182,7 @@ def collect_views(
         raise CalibrationFailed("move the arm to where the camera sees the board, and start again", code="no_board")
     route = _Route(collector, first, guess, _PLACES_PER_VIEW * wanted)
     while len(collector.views) < wanted:
-        q = route.next_position()
+        q = route.find_next_position()
         if q is None:
             break
         try:
@@ -228,7 +228,7 @@ class _Route:
         report(f"the camera is {1e3 * distance:.0f} mm and {np.degrees(angle):.1f} degrees from the initial guess")
         self._camera, self._board = camera, found.board
 
-    def next_position(self) -> Array | None:
+    def find_next_position(self) -> Array | None:
         """(n,) rad of the pose with the shortest motion that stays clear of the board; None if none is left."""
         here = self._collector.robot.state().q
         reached: list[tuple[float, int, Array]] = []
@@ -337,19 +337,19 @@ def plan_views(board: Board, K: Array, size: tuple[int, int], first: Pose, count
     found = []
     for k in range(count):
         distance = float(np.clip(_DISTANCES[k % 3] * np.linalg.norm(middle), min(near, far), far))
-        ray = _ray(middle, K, size, (k % 4) / 3.0)
-        facing = _shortest_rotation(start[:3, 2], ray) @ start[:3, :3]
+        ray = _aim_ray(middle, K, size, (k % 4) / 3.0)
+        facing = _find_rotation(start[:3, 2], ray) @ start[:3, :3]
         side = np.cross(ray, [1.0, 0.0, 0.0])
         side /= np.linalg.norm(side)
-        tilt = _rotation(_rotation(ray, k * _AZIMUTH) @ side, _TILTS[(k // 2) % 3])
+        tilt = _make_rotation(_make_rotation(ray, k * _AZIMUTH) @ side, _TILTS[(k // 2) % 3])
         pose = np.eye(4)
-        pose[:3, :3] = _rotation(ray, _TURNS[k % 5]) @ tilt @ facing
+        pose[:3, :3] = _make_rotation(ray, _TURNS[k % 5]) @ tilt @ facing
         pose[:3, 3] = distance * ray - pose[:3, :3] @ board.centre
         found.append(Pose.from_matrix(pose))
     return found
 
 
-def _ray(middle: Array, K: Array, size: tuple[int, int], share: float) -> Array:
+def _aim_ray(middle: Array, K: Array, size: tuple[int, int], share: float) -> Array:
     """Direction of the board's centre: from where it was first seen (0) to the centre of the image (1)."""
     seen = (K @ (middle / middle[2]))[:2]
     half = np.array(size) / 2.0
@@ -358,18 +358,18 @@ def _ray(middle: Array, K: Array, size: tuple[int, int], share: float) -> Array:
     return np.asarray(ray / np.linalg.norm(ray))
 
 
-def _rotation(axis: Array, angle: float) -> Array:
+def _make_rotation(axis: Array, angle: float) -> Array:
     """Rotation (3, 3) about a unit vector."""
     return motion(np.array([0.0, 0.0, 0.0, *(angle * axis)]))[:3, :3]
 
 
-def _shortest_rotation(a: Array, b: Array) -> Array:
+def _find_rotation(a: Array, b: Array) -> Array:
     """The shortest rotation (3, 3) from the unit vector ``a`` to ``b``."""
     axis = np.cross(a, b)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:
         return np.eye(3)
-    return _rotation(axis / sine, float(np.arctan2(sine, a @ b)))
+    return _make_rotation(axis / sine, float(np.arctan2(sine, a @ b)))
 
 
 def wait_for_enter() -> bool:

@@ -124,7 +124,7 @@ class Detector:
         aruco = self._cv2.aruco
         parameters = aruco.DetectorParameters()
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-        self._detector = aruco.CharucoDetector(board.for_opencv(), aruco.CharucoParameters(), parameters)
+        self._detector = aruco.CharucoDetector(board.make_opencv(), aruco.CharucoParameters(), parameters)
 
     def find(self, picture: NDArray[np.uint8], K: ArrayLike, distortion: ArrayLike) -> BoardDetection:
         """Detect the board.
@@ -147,7 +147,7 @@ class Detector:
         pixels, order = np.asarray(corners, float).reshape(-1, 2), np.asarray(numbers).reshape(-1)
         points = self.board.corners[order]
         self._check_enough(points)
-        side = self._smallest_side(pixels, points)
+        side = self._measure_smallest_side(pixels, points)
         pixels = self._refine_corners(grey, pixels, side)
         blur = edge_width(grey, pixels, side)
         if blur > max(3.0, BLURRED * side):
@@ -157,7 +157,7 @@ class Detector:
             pixels = undistort_pixels(pixels, camera, distortion)
         except ValueError as error:
             raise NoView(str(error), code="bad_distortion") from None
-        flat = self._on_one_plane(points, pixels)
+        flat = self._find_coplanar(points, pixels)
         if flat.sum() < _LEAST_FLAT * len(flat):
             raise NoView(
                 f"{(~flat).sum()} of {len(flat)} corners do not fit a flat board: {_NOT_FLAT}", code="not_flat"
@@ -180,13 +180,13 @@ class Detector:
         if np.linalg.svd(points[:, :2] - points[:, :2].mean(axis=0), compute_uv=False)[1] < self.board.square:
             raise NoView("the visible corners are along one line; show more of the board", code="too_few_corners")
 
-    def _on_one_plane(self, points: Array, pixels: Array) -> NDArray[np.bool_]:
+    def _find_coplanar(self, points: Array, pixels: Array) -> NDArray[np.bool_]:
         """(n,) which corners fit one plane; those of a misread marker do not."""
         cv2 = self._cv2
         _, inside = cv2.findHomography(np.ascontiguousarray(points[:, :2]), pixels, cv2.RANSAC, _WORST_CORNER)
         return np.zeros(len(points), bool) if inside is None else inside.reshape(-1).astype(bool)
 
-    def _smallest_side(self, pixels: Array, points: Array) -> float:
+    def _measure_smallest_side(self, pixels: Array, points: Array) -> float:
         """Side of the smallest square in the image, pixels: the least distance of two neighbours."""
         apart = np.linalg.norm(points[:, None] - points[None], axis=2) / self.board.square
         neighbours = (apart > 0.5) & (apart < 1.1)

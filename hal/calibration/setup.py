@@ -14,7 +14,7 @@ import yaml
 
 from ..config import load
 from ..config.data_files import data_folder
-from ..config.files import nearest, parse_yaml
+from ..config.files import parse_yaml, suggest
 from ..config.rigfile import RigFile
 from ..config.schema import PoseConfig
 from ..errors import CommandError
@@ -104,17 +104,15 @@ def find_setup(
                 code="missing_eye",
             )
         eye = "to-hand" if attached is None else "in-hand"
-    known = spec.view
-    ours = known is not None and (known.robot == arm.name if eye == "in-hand" else known.robot is None)
-    if known is not None and ours and eye == "in-hand" and link in (None, known.link) and attached is not None:
-        chosen, name = known.link or arm.kinematics.tcp_link, link or attached.link
-    else:
-        chosen = name = link or arm.kinematics.tcp_link
-        ours = ours and eye == "to-hand"
+    view, known = spec.view, None
+    chosen = name = link or arm.kinematics.tcp_link
+    if eye == "to-hand":
+        known = view if attached is None else None
+    elif view is not None and attached is not None and attached.robot == arm.name and link in (None, view.link):
+        known, chosen, name = view, view.link or chosen, link or attached.link
     _check_link(arm, chosen)
-    return CalibrationSetup(
-        spec.name, arm.name, eye, chosen, name, Pose(known.position, known.orientation) if known and ours else None
-    )
+    place = Pose(known.position, known.orientation) if known is not None else None
+    return CalibrationSetup(spec.name, arm.name, eye, chosen, name, place)
 
 
 def initial_guess(setup: CalibrationSetup, text: str | None) -> Pose:
@@ -150,7 +148,7 @@ def _choose(kind: str, name: str | None, specs: Mapping[str, Spec]) -> Spec:
             return next(iter(specs.values()))
         raise CommandError(f"--{kind} is needed; this rig has: {', '.join(specs) or 'none'}", code=f"missing_{kind}")
     if name not in specs:
-        raise CommandError(f"this rig has no {kind} {name!r}{nearest(name, specs)}", code=f"unknown_{kind}")
+        raise CommandError(f"this rig has no {kind} {name!r}{suggest(name, specs)}", code=f"unknown_{kind}")
     return specs[name]
 
 
@@ -158,7 +156,7 @@ def _check_link(arm: RobotSpec, link: str) -> None:
     """Raise CommandError unless the link exists and moves with the arm's joints alone."""
     urdf = read_urdf(Path(arm.urdf))
     if link not in urdf.links:
-        raise CommandError(f"robot {arm.name!r} has no link {link!r}{nearest(link, urdf.links)}", code="unknown_link")
+        raise CommandError(f"robot {arm.name!r} has no link {link!r}{suggest(link, urdf.links)}", code="unknown_link")
     others = [joint.name for joint in urdf.above(link) if joint.movable and joint.name not in arm.joints]
     if others:
         raise CommandError(
@@ -195,9 +193,9 @@ class RigFileOutput:
         self.source, self.path, self.camera = source, path, camera
         if not self.path.resolve().parent.is_dir():
             raise CommandError(f"there is no folder {self.path.resolve().parent}", code="no_folder")
-        self._changed("pose", "[0, 0, 0, 0, 0, 0, 1]")
+        self._replace_place("pose", "[0, 0, 0, 0, 0, 0, 1]")
 
-    def _changed(self, key: str, value: str) -> str:
+    def _replace_place(self, key: str, value: str) -> str:
         return replace_camera_place(self.source.read_bytes().decode("utf-8"), self.camera, key, value)
 
     def write(self, key: str, value: str) -> list[str]:
@@ -210,7 +208,7 @@ class RigFileOutput:
             ConfigError: The new file would not be a valid rig; nothing is changed.
             OSError: The file cannot be written; nothing is changed.
         """
-        text = self._changed(key, value)
+        text = self._replace_place(key, value)
         trial = self.path.resolve().with_name(f".{self.path.name}.trial.yaml")
         try:
             write_file(trial, text)
@@ -246,8 +244,8 @@ def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
     entry = f"{key}: {value}"
     by_hand = f"edit cameras.{camera} by hand: replace {', '.join(PLACES)} with\n  {entry}"
     try:
-        changed = _edited(text, camera, entry)
-        fits = parse_yaml(changed) == _expected(parse_yaml(text), camera, key, value)
+        changed = _edit_text(text, camera, entry)
+        fits = parse_yaml(changed) == _change_data(parse_yaml(text), camera, key, value)
     except (yaml.YAMLError, LookupError, TypeError) as error:
         raise CommandError(f"the file cannot be edited ({error}); {by_hand}", code="not_editable") from None
     if not fits:
@@ -257,14 +255,14 @@ def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
     return changed
 
 
-def _expected(data: Any, camera: str, key: str, value: str) -> Any:
+def _change_data(data: Any, camera: str, key: str, value: str) -> Any:
     """The file's data after the change."""
     entries = {name: item for name, item in data["cameras"][camera].items() if name not in PLACES}
     entries[key] = parse_yaml(value)
     return {**data, "cameras": {**data["cameras"], camera: entries}}
 
 
-def _edited(text: str, camera: str, entry: str) -> str:
+def _edit_text(text: str, camera: str, entry: str) -> str:
     """The new text. Raises LookupError and TypeError if the file has another structure than expected."""
     root = yaml.compose(text, Loader=yaml.SafeLoader)  # in Python, since libyaml's counts bytes
     settings = _value(_value(root, "cameras"), camera)

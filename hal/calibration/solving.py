@@ -226,9 +226,9 @@ def solve(views: Sequence[View], eye: Eye) -> Calibration:
     C = np.array([view.detection.T_camera_board.matrix() for view in views])
     _check_rotation(A)
     corners = _Corners.of(eye, A, [view.detection for view in views])
-    used, fit = _without_bad_views(corners, *_closed_form(A, C), [view.name for view in views])
+    used, fit = _drop_bad_views(corners, *_closed_form(A, C), [view.name for view in views])
     _check_rotation(A[used])
-    kept = corners.only(used)
+    kept = corners.select(used)
     fits = [_refine(kept, fit.X, fit.Z, arm_error) for arm_error in _ARM_ERRORS]
     best = int(np.argmax([one.likelihood for one in fits]))
     arm_error = _ARM_ERRORS[best]
@@ -268,7 +268,7 @@ def inverse(poses: Array) -> Array:
     return result
 
 
-def _between(a: Array, b: Array) -> tuple[float, float]:
+def _compare(a: Array, b: Array) -> tuple[float, float]:
     """Distance, m, and angle, rad, between two poses (4, 4)."""
     turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3])
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(turn.magnitude())
@@ -363,7 +363,7 @@ class _Corners(NamedTuple):
             max(_LEAST_PX, noise),
         )
 
-    def only(self, views: NDArray[np.bool_]) -> _Corners:
+    def select(self, views: NDArray[np.bool_]) -> _Corners:
         """Those of the views in a mask (v,)."""
         kept = views[self.view]
         number = (np.cumsum(views) - 1)[self.view[kept]]
@@ -452,14 +452,14 @@ def _refine(
     rest = np.linalg.norm(decorrelate(corners.errors(X, Z), power=1.0), axis=1)
     usual = max(_LEAST_PX / corners.noise_px, float(np.median(rest)) / 1.18)  # of one coordinate
 
-    def moved(step: Array) -> tuple[Array, Array]:
+    def move(step: Array) -> tuple[Array, Array]:
         return X @ motion(step[_X]), Z @ motion(step[_Z])
 
     def residuals(step: Array) -> Array:
-        return decorrelate(corners.errors(*moved(step))).reshape(-1)
+        return decorrelate(corners.errors(*move(step))).reshape(-1)
 
     def jacobian(step: Array) -> Array:
-        return decorrelate(corners.derivatives(*moved(step), slice(0, 12))).reshape(-1, 12)
+        return decorrelate(corners.derivatives(*move(step), slice(0, 12))).reshape(-1, 12)
 
     found = least_squares(
         residuals,
@@ -471,7 +471,7 @@ def _refine(
         ftol=tolerance,
         max_nfev=_ROUNDS,
     )
-    best_X, best_Z = moved(found.x)
+    best_X, best_Z = move(found.x)
     left = residuals(found.x)
     columns = decorrelate(corners.derivatives(best_X, best_Z, slice(0, 13))).reshape(-1, 13)
     weights = np.sqrt(np.minimum(1.0, _HUBER * usual / np.maximum(np.abs(left), 1e-12)))
@@ -485,7 +485,7 @@ def _rms_per_view(corners: _Corners, X: Array, Z: Array) -> Array:
     return np.asarray(np.sqrt(corners.sum_per_view(squares) / np.bincount(corners.view)))
 
 
-def _without_bad_views(corners: _Corners, X: Array, Z: Array, names: Sequence[str]) -> tuple[NDArray[np.bool_], _Fit]:
+def _drop_bad_views(corners: _Corners, X: Array, Z: Array, names: Sequence[str]) -> tuple[NDArray[np.bool_], _Fit]:
     """Mask (v,) of the views that fit each other, and their fit. A view may also be taken back."""
     used = np.ones(len(names), bool)
     fit = _refine(corners, X, Z, 0.0, rounds=3)
@@ -502,16 +502,16 @@ def _without_bad_views(corners: _Corners, X: Array, Z: Array, names: Sequence[st
         if (good == used).all():
             break
         used = good
-        fit = _refine(corners.only(used), fit.X, fit.Z, 0.0, rounds=2)
+        fit = _refine(corners.select(used), fit.X, fit.Z, 0.0, rounds=2)
     return used, fit
 
 
 def _uncertainty(corners: _Corners, fit: _Fit, arm_error: float) -> Uncertainty:
     count = len(corners.A)
     everything = np.arange(count)
-    without = [_refine(corners.only(everything != k), fit.X, fit.Z, arm_error) for k in everything]
+    without = [_refine(corners.select(everything != k), fit.X, fit.Z, arm_error) for k in everything]
     turns = [Rotation.from_matrix(fit.X[:3, :3].T @ one.X[:3, :3]).as_rotvec() for one in without]
-    moved = tuple(_between(fit.X, one.X) for one in without)
+    moved = tuple(_compare(fit.X, one.X) for one in without)
 
     def std(values: list[Array] | list[float]) -> float:
         samples = np.array(values)
@@ -560,6 +560,6 @@ def _residuals(
     """``boards`` (v, 4, 4): the board by each image alone; ``Z`` (4, 4): by all of them."""
     moved = iter(std.moved)
     return tuple(
-        Residual(view.name, float(px[k]), *_between(boards[k], Z), bool(used[k]), next(moved) if used[k] else None)
+        Residual(view.name, float(px[k]), *_compare(boards[k], Z), bool(used[k]), next(moved) if used[k] else None)
         for k, view in enumerate(views)
     )

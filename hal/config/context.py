@@ -23,7 +23,7 @@ from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
 from ..specs import CameraSpec, RobotSpec
 from .data_files import user_path
-from .files import Problems, nearest, read_yaml, validate, with_holes
+from .files import Problems, leave_holes, read_yaml, suggest, validate
 from .models import CameraModel, FileSource, GripperModel, RobotModel, find_model
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
@@ -36,7 +36,7 @@ __all__ = [
     "is_emulated",
     "load_arm",
     "load_urdf",
-    "options_of",
+    "merge_options",
 ]
 
 Model = TypeVar("Model", RobotModel, CameraModel)
@@ -87,11 +87,11 @@ class Context:
         """Name of the engine that simulates this rig."""
         return registry.choose_engine(self.engine or self.rig.simulation.engine)
 
-    def problem(self, key: str, message: str, code: str) -> None:
+    def report(self, key: str, message: str, code: str) -> None:
         """Add a problem in the rig's file; the arguments are those of :meth:`.files.Problems.add`."""
         self.problems.add(self.source, key, message, code)
 
-    def simulated(self, device: Device, parent: Device | None = None) -> bool:
+    def is_simulated(self, device: Device, parent: Device | None = None) -> bool:
         """Return whether a device is simulated; ``parent`` is the arm of a gripper."""
         if self.sim is True or self.driver is not None:
             return True
@@ -109,25 +109,25 @@ class Context:
             if isinstance(found, Path):
                 data = read_yaml(found, self.problems)
                 if data is not None and isinstance(config, RobotConfig):
-                    data = self._chosen_arm(key, config, data)
+                    data = self._choose_arm(key, config, data)
                 if data is not None:
                     return validate(kind, data, found, self.problems), found
             else:
-                self.problem(f"{key}.model", found, "unknown_model")
-        return with_holes(kind, None, ()), self.base
+                self.report(f"{key}.model", found, "unknown_model")
+        return leave_holes(kind, None, ()), self.base
 
-    def _chosen_arm(self, key: str, config: RobotConfig, data: dict[str, Any]) -> dict[str, Any] | None:
+    def _choose_arm(self, key: str, config: RobotConfig, data: dict[str, Any]) -> dict[str, Any] | None:
         """Return a model with the keys of one of its arms; None, and a problem, if the rig names none of them."""
         arms = data.get("arms")
         chosen = getattr(config, "arm", None)
         if not isinstance(arms, dict) or not arms:
             if chosen is not None:
-                self.problem(f"{key}.arm", f"model {config.model!r} has one arm only", "unknown_arm")
+                self.report(f"{key}.arm", f"model {config.model!r} has one arm only", "unknown_arm")
             return data
         own = arms.get(chosen) if chosen is not None else None
         if not isinstance(own, dict):
             message = f"must be one of {', '.join(map(str, arms))}: model {config.model!r} has several arms"
-            self.problem(f"{key}.arm", message, "unknown_arm")
+            self.report(f"{key}.arm", message, "unknown_arm")
             return None
         return {**{name: value for name, value in data.items() if name != "arms"}, **own}
 
@@ -144,21 +144,21 @@ class Context:
             parent: The arm of a gripper.
         """
         with suppress(Unknown):
-            name = self.driver or self._named_driver(kind, key, config, model, parent)
+            name = self.driver or self._find_driver(kind, key, config, model, parent)
             if name is not None and self.check_driver(name, kind, key):
                 self.drivers[key] = name
                 return name
         return ""
 
-    def _named_driver(
+    def _find_driver(
         self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None
     ) -> str | None:
-        flag, state = ("sim", "simulated") if self.simulated(config, parent) else ("real", "real")
+        flag, state = ("sim", "simulated") if self.is_simulated(config, parent) else ("real", "real")
         own: str | None = getattr(config.drivers, flag) if config.drivers is not None else None
         chosen: str | None = own or getattr(model.drivers, flag)
         if chosen is None:
             message = f"its model has no driver for a {state} {kind}; name one in {key}.drivers.{flag}"
-            self.problem(key, message, "no_driver")
+            self.report(key, message, "no_driver")
         return self.engine_driver if flag == "sim" and registry.is_engine(chosen) else chosen
 
     def check_driver(self, name: str, kind: str, key: str) -> bool:
@@ -166,11 +166,11 @@ class Context:
         try:
             found = registry.driver(name)
         except HalError as error:
-            self.problem(key, str(error), "unknown_driver")
+            self.report(key, str(error), "unknown_driver")
             return False
         if getattr(found, kind) is None:
             message = f"driver {name!r} has no {kind}; it has: {', '.join(found.kinds) or 'nothing'}"
-            self.problem(key, message, "wrong_driver")
+            self.report(key, message, "wrong_driver")
             return False
         return True
 
@@ -286,7 +286,7 @@ def _locate(
     if not os.path.isfile(path):
         beside = path.parent.iterdir() if path.parent.is_dir() else ()
         there = sorted(one.name for one in beside if one.suffix.lower() in ends)
-        hint = nearest(path.name, there) if there else ""
+        hint = suggest(path.name, there) if there else ""
         problems.add(file, key, f"there is no file {path}{hint}", "missing_file")
         return None
     return path
@@ -295,7 +295,7 @@ def _locate(
 # What only one driver needs: its options, and its own check of a device's record.
 
 
-def options_of(
+def merge_options(
     config: Config, model: DrivenModel, simulated: bool, driver: str, base: Path | None = None, file: Path | None = None
 ) -> dict[str, Any]:
     """Return the rig's options for a driver, on top of the model's, which apply to the model's own driver only.
@@ -308,11 +308,11 @@ def options_of(
     of_rig = config.simulated if simulated else config.real
     if base is not None and file is not None and driver:
         paths = registry.driver(driver).path_options
-        of_model, of_rig = _absolute(of_model, paths, file.parent), _absolute(of_rig, paths, base)
+        of_model, of_rig = _make_absolute(of_model, paths, file.parent), _make_absolute(of_rig, paths, base)
     return {**of_model, **of_rig}
 
 
-def _absolute(options: Mapping[str, Any], paths: Collection[str], folder: Path) -> dict[str, Any]:
+def _make_absolute(options: Mapping[str, Any], paths: Collection[str], folder: Path) -> dict[str, Any]:
     """Make the options in ``paths`` absolute; values that are not text are left to the driver's check."""
     return {
         name: str(user_path(value, folder)) if name in paths and isinstance(value, str) else value
@@ -369,14 +369,14 @@ def _add(
 ) -> None:
     """Add problems (key in the entry, message, code) to the rig's file, or to the model's if that has the key."""
     for relative, message, code in found:
-        in_model = _key_in_model(relative, config, model, context)
+        in_model = _find_model_key(relative, config, model, context)
         if in_model is not None:
             context.problems.add(file, f"{part}{in_model}", message, code)
         else:
-            context.problem(f"{key}.{part}{relative}", message, code)
+            context.report(f"{key}.{part}{relative}", message, code)
 
 
-def _key_in_model(relative: str, config: Config, model: DrivenModel, context: Context) -> str | None:
+def _find_model_key(relative: str, config: Config, model: DrivenModel, context: Context) -> str | None:
     """Return the key of the model that has the value of the key ``relative`` of an entry; None if the entry has it."""
     section, _, rest = relative.partition(".")
     name = rest.partition(".")[0]
@@ -386,7 +386,7 @@ def _key_in_model(relative: str, config: Config, model: DrivenModel, context: Co
         given = config.limits.model_fields_set
         if name in given if name else given:
             return None
-        tighter = name in model.real_limits.model_fields_set and not context.simulated(config)
+        tighter = name in model.real_limits.model_fields_set and not context.is_simulated(config)
         return f"real_{relative}" if tighter else relative
     if section in ("capture", "depth", "field_of_view") and isinstance(config, CameraConfig):
         return relative if getattr(config, section) is None else None

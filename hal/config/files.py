@@ -28,22 +28,22 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import ConfigError, Problem
 from .data_files import data_folder, is_path, list_data, user_path
-from .schema import ValueProblem, describe, keys_at, kind_inside, record_in
+from .schema import ValueProblem, describe, find_kind, find_record, list_keys
 
 __all__ = [
     "PlacedErrors",
     "Problems",
     "apply_overrides",
     "check_size",
-    "closest",
+    "find_closest",
     "load_record",
-    "nearest",
+    "suggest",
     "parse_yaml",
-    "plain_copy",
+    "copy_plain",
     "read_yaml",
     "validate",
-    "with_holes",
-    "yaml_problem",
+    "leave_holes",
+    "describe_yaml_error",
 ]
 
 
@@ -81,24 +81,24 @@ class Problems:
             raise ConfigError(self.found)
 
 
-def closest(word: str, choices: Iterable[str]) -> str | None:
+def find_closest(word: str, choices: Iterable[str]) -> str | None:
     """Return the one of ``choices`` that ``word`` probably means; None if none is near."""
     return next(iter(difflib.get_close_matches(word, sorted(choices), n=1)), None)
 
 
-def nearest(word: str, choices: Iterable[str]) -> str:
+def suggest(word: str, choices: Iterable[str]) -> str:
     """Return ``"; did you mean ...? available: ..."`` for a name that is not among ``choices``."""
     known = sorted(choices)
-    close = closest(word, known)
+    close = find_closest(word, known)
     hint = f"; did you mean {close!r}?" if close else ";"
     return f"{hint} available: {', '.join(known)}" if known else "; none are available"
 
 
-def plain_copy(value: Any) -> Any:
+def copy_plain(value: Any) -> Any:
     """Return a deep copy of nested dicts and lists; the values in them are not copied."""
     if isinstance(value, Mapping):
-        return {key: plain_copy(item) for key, item in value.items()}
-    return [plain_copy(item) for item in value] if isinstance(value, (list, tuple)) else value
+        return {key: copy_plain(item) for key, item in value.items()}
+    return [copy_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 # YAML
@@ -147,7 +147,7 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
             text = file.read(MAX_BYTES + 1).decode("utf-8")
     except FileNotFoundError:
         siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
-        hint = nearest(path.name, siblings) if siblings else ""
+        hint = suggest(path.name, siblings) if siblings else ""
         problems.add(path, "", f"there is no such file{hint}", "missing_file")
         return None
     except (OSError, UnicodeDecodeError) as error:
@@ -156,7 +156,7 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
     try:
         data, twice = _read_document(text)
     except yaml.YAMLError as error:
-        problems.add(path, "", yaml_problem(error), getattr(error, "code", "bad_yaml"))
+        problems.add(path, "", describe_yaml_error(error), getattr(error, "code", "bad_yaml"))
         return None
     for key, message in twice:
         problems.add(path, key, message, "duplicate_key")
@@ -164,7 +164,7 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
         problem = "is empty" if data is _EMPTY else f"must be keys and values, not {describe(data)}"
         problems.add(path, "", problem, "wrong_type")
         return None
-    return plain_copy(data)  # type: ignore[no-any-return]
+    return copy_plain(data)  # type: ignore[no-any-return]
 
 
 _EMPTY = object()
@@ -191,7 +191,7 @@ def parse_yaml(text: str) -> Any:
     return yaml.load(text, Loader=_Loader)
 
 
-def yaml_problem(error: yaml.YAMLError) -> str:
+def describe_yaml_error(error: yaml.YAMLError) -> str:
     """Return the problem in a YAML document, with line and column where they are known."""
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     problem = getattr(error, "problem", None) or getattr(error, "context", None) or str(error)
@@ -295,7 +295,7 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
         problems: Gets the problems.
         prefix: Dotted key of the data in the file.
     """
-    data = plain_copy(data)
+    data = copy_plain(data)
     guessed: set[Place] = set()
     while True:  # each round respells some keys
         try:
@@ -306,14 +306,14 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
         for one in unknown or found:
             # A value that does not fit a key that was only guessed is not a problem.
             if one["loc"] not in guessed or isinstance(one["input"], dict):
-                problems.add(file, _dotted(prefix, one["loc"]), *_message_and_code(model, one))
+                problems.add(file, _join_key(prefix, one["loc"]), *_explain_error(model, one))
         if not unknown:
-            return with_holes(model, data, [one["loc"] for one in found])
+            return leave_holes(model, data, [one["loc"] for one in found])
         for one in unknown:
             right = _respell(model, data, one["loc"])
             if right is not None:
                 guessed.add(right)
-                problems.written[str(file), _dotted(prefix, right)] = str(one["loc"][-1])
+                problems.written[str(file), _join_key(prefix, right)] = str(one["loc"][-1])
 
 
 def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folder: str, kind: str) -> M:
@@ -341,7 +341,7 @@ def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folde
         elif name in (there := list_data("config", folder)):
             path = data_folder("config") / folder / f"{name}.yaml"
         else:
-            message = f"there is no {kind.replace('_', ' ')} {name!r}{nearest(name, there)}, or a path to your own"
+            message = f"there is no {kind.replace('_', ' ')} {name!r}{suggest(name, there)}, or a path to your own"
             raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), message, f"unknown_{kind}")])
         data = read_yaml(path, problems)
         problems.raise_any()
@@ -350,7 +350,7 @@ def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folde
     return result
 
 
-def with_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:
+def leave_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:
     """Return a record of ``data`` without the places in ``wrong``; of holes only if ``data`` is not a dict."""
     values: dict[str, Any] = {}
     holes: set[str] = set()
@@ -358,11 +358,11 @@ def with_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:
         if not isinstance(data, dict) or (name not in data and field.is_required()):
             holes.add(name)
         elif name in data:
-            inside = _inside(wrong, name)
+            inside = _select_inside(wrong, name)
             if not inside:
                 kind: Any = Annotated[field.annotation, field]
                 values[name] = TypeAdapter(kind).validate_python(data[name])
-            elif (value := _rest(field.annotation, data[name], inside)) is not None:
+            elif (value := _keep_valid(field.annotation, data[name], inside)) is not None:
                 values[name] = value
             else:
                 holes.add(name)
@@ -372,19 +372,19 @@ def with_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:
     return record
 
 
-def _rest(kind: Any, value: Any, wrong: Collection[Place]) -> Any:
+def _keep_valid(kind: Any, value: Any, wrong: Collection[Place]) -> Any:
     """Return the valid part of a record or of a dict of records; None for any other kind of value."""
     if not isinstance(value, dict):
         return None
-    record, item = record_in(kind), record_in(kind_inside(kind, ""))
+    record, item = find_record(kind), find_record(find_kind(kind, ""))
     if record is not None:
-        return with_holes(record, value, wrong)
+        return leave_holes(record, value, wrong)
     if item is not None:
-        return {str(key): with_holes(item, inner, _inside(wrong, key)) for key, inner in value.items()}
+        return {str(key): leave_holes(item, inner, _select_inside(wrong, key)) for key, inner in value.items()}
     return None
 
 
-def _inside(places: Collection[Place], key: Any) -> list[Place]:
+def _select_inside(places: Collection[Place], key: Any) -> list[Place]:
     return [place[1:] for place in places if place[:1] == (key,)]
 
 
@@ -394,32 +394,32 @@ def _respell(model: type[BaseModel], data: Any, place: Place) -> Place | None:
     for part in outer:
         data = data[part]
     value = data.pop(given)
-    right = closest(str(given), keys_at(model, outer))
+    right = find_closest(str(given), list_keys(model, outer))
     if right is None or right in data:
         return None
     data[right] = value
     return (*outer, right)
 
 
-def _dotted(prefix: str, place: Place) -> str:
+def _join_key(prefix: str, place: Place) -> str:
     return ".".join(str(part) for part in (*filter(None, [prefix]), *place) if part != "[key]")
 
 
-def _message_and_code(model: type[BaseModel], found: Any) -> tuple[str, str]:
+def _explain_error(model: type[BaseModel], found: Any) -> tuple[str, str]:
     """Return message and code of one of pydantic's errors."""
     kind, loc, given = found["type"], found["loc"], found["input"]
     if kind == "missing":
         return "is missing", "missing_key"
     if kind == "extra_forbidden":
-        return f"unknown key{nearest(str(loc[-1]), keys_at(model, loc[:-1]))}", "unknown_key"
+        return f"unknown key{suggest(str(loc[-1]), list_keys(model, loc[:-1]))}", "unknown_key"
     if kind == "value_error":
         error = found["ctx"]["error"]
         return str(error), error.code if isinstance(error, ValueProblem) else "invalid"
     if kind == "literal_error":
         choices = [part.strip("' ") for part in found["ctx"]["expected"].replace(" or ", ", ").split(",")]
-        return f"{describe(given)} is not possible{nearest(str(given), choices)}", "invalid_choice"
+        return f"{describe(given)} is not possible{suggest(str(given), choices)}", "invalid_choice"
     if kind in ("model_type", "dict_type", "model_attributes_type"):
-        keys = ", ".join(keys_at(model, loc))
+        keys = ", ".join(list_keys(model, loc))
         return f"must be keys and values, not {describe(given)}" + (f"; keys: {keys}" if keys else ""), "wrong_type"
     if kind in ("too_long", "too_short"):
         bounds = found["ctx"]
@@ -466,7 +466,7 @@ def apply_overrides(
         overrides: ``"KEY=VALUE"`` with dotted keys and the values in YAML, or a mapping from dotted keys to values.
         problems: Gets the problems in the form of the overrides.
     """
-    result = plain_copy(data)
+    result = copy_plain(data)
     for key, value in _pairs(overrides, problems):
         _put(result, key, value, problems)
     return dict(result)
@@ -485,7 +485,7 @@ def _pairs(overrides: Sequence[str] | Mapping[str, Any], problems: Problems) -> 
         try:
             pairs.append((key.strip(), parse_yaml(value)))
         except yaml.YAMLError as error:
-            problems.add(SET, key.strip(), f"the value {yaml_problem(error)}", "bad_yaml")
+            problems.add(SET, key.strip(), f"the value {describe_yaml_error(error)}", "bad_yaml")
     return pairs
 
 
@@ -498,7 +498,7 @@ def _put(data: dict[str, Any], key: str, value: Any, problems: Problems) -> None
     if len(parts) > 2 and parts[0] in SECTIONS:
         known = data.get(parts[0]) or {}
         if isinstance(known, dict) and parts[1] not in known:
-            message = f"this rig has no {SECTIONS[parts[0]]} {parts[1]!r}{nearest(parts[1], known)}"
+            message = f"this rig has no {SECTIONS[parts[0]]} {parts[1]!r}{suggest(parts[1], known)}"
             problems.add(SET, key, message, "unknown_device")
             return
     place: Any = data

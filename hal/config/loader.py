@@ -16,7 +16,7 @@ from .. import registry
 from ..specs import Plan
 from .context import Context
 from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, apply_overrides, nearest, read_yaml, validate
+from .files import Problems, apply_overrides, read_yaml, suggest, validate
 from .resolve import resolve
 from .rigfile import RigFile
 
@@ -63,7 +63,7 @@ def load(
     problems = Problems()
     _check_arguments(sim, clock, engine, problems)
     engine = None if problems.found else engine  # after a problem the rest is checked, too
-    stand_in = _stand_in(driver, problems)
+    stand_in = _choose_stand_in(driver, problems)
     data, source, base = _read(config, problems)
     if data is None:
         problems.raise_any()
@@ -78,12 +78,12 @@ def _check_arguments(sim: object, clock: str | None, engine: str | None, problem
     if sim is not None and not isinstance(sim, bool):
         problems.add("<arguments>", "sim", f"must be true, false or None, not {sim!r}", "wrong_type")
     if clock is not None and clock not in CLOCKS:
-        problems.add("<arguments>", "clock", f"{clock!r} is not possible{nearest(clock, CLOCKS)}", "invalid_choice")
+        problems.add("<arguments>", "clock", f"{clock!r} is not possible{suggest(clock, CLOCKS)}", "invalid_choice")
     if engine is not None and (message := registry.explain_engine(str(engine))):
         problems.add("<arguments>", "engine", message, "invalid_choice")
 
 
-def _stand_in(driver: str | None, problems: Problems) -> str | None:
+def _choose_stand_in(driver: str | None, problems: Problems) -> str | None:
     """Return the driver that replaces every other; after a problem one that can, so that the rest is checked, too."""
     if driver is None:
         return None
@@ -104,7 +104,7 @@ def _read(config: str | Path | Mapping[str, Any], problems: Problems) -> tuple[d
         return read_yaml(path, problems), str(path), path.parent
     rigs = list_data("config")
     if name not in rigs:
-        message = f"there is no rig {name!r}{nearest(name, rigs)}, or a path to your own"
+        message = f"there is no rig {name!r}{suggest(name, rigs)}, or a path to your own"
         problems.add("<arguments>", "config", message, "unknown_rig")
         return None, name, Path.cwd()
     path = data_folder("config") / f"{name}.yaml"

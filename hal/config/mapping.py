@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ..types import AXES, BUTTONS, PadState
-from .files import load_record, nearest
+from .files import load_record, suggest
 from .schema import Flag, Quantity, Strict, ValueProblem
 
 __all__ = ["AxisMapping", "DirectionsMapping", "GripperMapping", "TeleopMapping", "TurnsMapping", "load_mapping"]
@@ -31,13 +31,13 @@ class AxisMapping(Strict):
     invert: Flag = False
 
     @model_validator(mode="after")
-    def _one_control(self) -> AxisMapping:
+    def _check_control(self) -> AxisMapping:
         if (self.axis is None) == (self.buttons is None):
             raise ValueProblem("needs an axis, or two buttons [backwards, forwards]", "missing_key")
         if self.axis is not None:
-            _known(self.axis, AXES, "axis")
+            _check_name(self.axis, AXES, "axis")
         for button in self.buttons or ():
-            _known(button, BUTTONS, "button")
+            _check_name(button, BUTTONS, "button")
         return self
 
     @property
@@ -84,19 +84,19 @@ class GripperMapping(Strict):
     """Button that closes an open gripper and opens a closed one."""
 
     @model_validator(mode="after")
-    def _one_control(self) -> GripperMapping:
+    def _check_control(self) -> GripperMapping:
         ways = (self.axis is not None, self.open is not None or self.close is not None, self.toggle is not None)
         if sum(ways) != 1:
             raise ValueProblem("needs an axis, or the buttons open and close, or one button: toggle", "conflict")
         if self.axis is not None:
-            _known(self.axis, AXES, "axis")
+            _check_name(self.axis, AXES, "axis")
         elif self.toggle is not None:
-            _known(self.toggle, BUTTONS, "button")
+            _check_name(self.toggle, BUTTONS, "button")
         elif self.open is None or self.close is None:
             raise ValueProblem("needs both buttons, open and close", "missing_key")
         else:
-            _known(self.open, BUTTONS, "button")
-            _known(self.close, BUTTONS, "button")
+            _check_name(self.open, BUTTONS, "button")
+            _check_name(self.close, BUTTONS, "button")
         return self
 
     @property
@@ -125,20 +125,20 @@ class TeleopMapping(Strict):
 
     @field_validator("deadman", "go_home", "other_arm")
     @classmethod
-    def _is_button(cls, name: str | None) -> str | None:
+    def _check_button(cls, name: str | None) -> str | None:
         if name is not None:
-            _known(name, BUTTONS, "button")
+            _check_name(name, BUTTONS, "button")
         return name
 
     @field_validator("actions")
     @classmethod
-    def _are_buttons(cls, actions: dict[str, str]) -> dict[str, str]:
+    def _check_buttons(cls, actions: dict[str, str]) -> dict[str, str]:
         for name in actions.values():
-            _known(name, BUTTONS, "button")
+            _check_name(name, BUTTONS, "button")
         return actions
 
     @model_validator(mode="after")
-    def _controls(self) -> TeleopMapping:
+    def _check_distinct(self) -> TeleopMapping:
         moving = {control for mapping in self.axes() if mapping is not None for control in mapping.controls}
         moving |= set(self.gripper.controls) if self.gripper else set()
         alone = [self.deadman, *self.actions.values(), *filter(None, (self.go_home, self.other_arm))]
@@ -175,6 +175,6 @@ def load_mapping(mapping: str | Path | Mapping[str, Any] | TeleopMapping = "defa
     return load_record(TeleopMapping, mapping, "teleop", "mapping")
 
 
-def _known(name: str, choices: tuple[str, ...], kind: str) -> None:
+def _check_name(name: str, choices: tuple[str, ...], kind: str) -> None:
     if name not in choices:
-        raise ValueProblem(f"there is no {kind} {name!r}{nearest(name, choices)}", "unknown_control")
+        raise ValueProblem(f"there is no {kind} {name!r}{suggest(name, choices)}", "unknown_control")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, nearest, read_yaml
+from .files import Problems, read_yaml, suggest
 from .schema import (
     Accelerations,
     CameraRate,
@@ -58,7 +58,7 @@ __all__ = [
     "SensorStream",
     "StreamModel",
     "ToolModel",
-    "by_name",
+    "expand_names",
     "find_model",
     "load_pad_models",
 ]
@@ -80,7 +80,7 @@ class FileSource(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _plain_path(cls, data: Any) -> Any:
+    def _expand_path(cls, data: Any) -> Any:
         return {"path": data} if isinstance(data, str) else data
 
 
@@ -117,7 +117,7 @@ class FingerModel(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _plain_name(cls, data: Any) -> Any:
+    def _expand_name(cls, data: Any) -> Any:
         return {"name": data} if isinstance(data, str) else data
 
 
@@ -164,7 +164,7 @@ class GripperModel(Strict):
         return self.force if self.force_max is None else self.force_max
 
     @model_validator(mode="after")
-    def _both_ends(self) -> GripperModel:
+    def _check_fingers(self) -> GripperModel:
         if self.force > self.strongest:
             raise ValueProblem(f"force must be at most force_max, {self.strongest:g} N", "out_of_range")
         given = [end is not None for joint in self.joints for end in (joint.open, joint.closed)]
@@ -174,13 +174,13 @@ class GripperModel(Strict):
             raise ValueProblem("open and closed of a joint must differ", "empty_range")
         if self.widths and not any(given):
             raise ValueProblem("joints need open and closed where widths are given", "missing_key")
-        if self.widths and self._turned():
+        if self.widths and self._is_turned():
             raise ValueProblem("widths grow where the first joint goes from open to closed", "wrong_order")
         if self.widths and max(width for _, width in self.widths) < self.width_max:
             raise ValueProblem(f"widths end below width_max, {self.width_max:g} m", "out_of_range")
         return self
 
-    def _turned(self) -> bool:
+    def _is_turned(self) -> bool:
         """Return whether the widths grow where the joint closes."""
         first, (near, less), (far, more) = self.joints[0], self.widths[0], self.widths[-1]
         return (first.open - first.closed) * (far - near) * (more - less) < 0.0  # type: ignore[operator]  # both given
@@ -262,7 +262,7 @@ class FieldOfView(Strict):
     height: Pixels | None = None
 
     @model_validator(mode="after")
-    def _complete(self) -> FieldOfView:
+    def _check_complete(self) -> FieldOfView:
         if self.horizontal_deg is None and self.vertical_deg is None:
             raise ValueProblem("needs horizontal_deg, vertical_deg or both", "missing_key")
         if (self.width is None) != (self.height is None):
@@ -277,7 +277,7 @@ class Depth(Strict):
     max: Annotated[float, Quantity("m", 0.0, 1000.0, above=True)]
 
     @model_validator(mode="after")
-    def _ordered(self) -> Depth:
+    def _check_order(self) -> Depth:
         if self.min >= self.max:
             raise ValueProblem(f"min must be less than max, not {self.min:g} and {self.max:g}", "empty_range")
         return self
@@ -294,7 +294,7 @@ class Capture(Strict):
         return f"{self.width}x{self.height} at {self.rate_hz:g} Hz"
 
 
-def by_name(value: Any) -> Any:
+def expand_names(value: Any) -> Any:
     """Return ``[color, depth]`` as ``{color: {}, depth: {}}``; a name without a value becomes ``{}``, too."""
     if isinstance(value, (list, tuple)):
         return {str(name): {} for name in value}
@@ -332,7 +332,7 @@ SensorStream = Literal["color", "depth", "infrared", "infrared_right"]
 _MADE_FROM = {"infrared_right": "infrared", "infrared": "depth"}
 
 
-def _three() -> dict[SensorStream, StreamModel]:
+def _make_streams() -> dict[SensorStream, StreamModel]:
     return {"color": StreamModel(), "depth": StreamModel(), "infrared": StreamModel()}
 
 
@@ -356,7 +356,9 @@ class CameraModel(Strict):
     )
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth: Depth
-    streams: Annotated[dict[SensorStream, StreamModel], BeforeValidator(by_name)] = Field(default_factory=_three)
+    streams: Annotated[dict[SensorStream, StreamModel], BeforeValidator(expand_names)] = Field(
+        default_factory=_make_streams
+    )
     """The camera's streams: ``[color, depth]``, or ``{color: {modes: ...}, ...}`` where they differ."""
     depth_sensor: DepthSensor | None = None
     adjustable: Flag = False
@@ -365,9 +367,9 @@ class CameraModel(Strict):
     simulated: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _complete(self) -> CameraModel:
+    def _check_complete(self) -> CameraModel:
         for name in self.streams:
-            if self._of(name, "field_of_view") is None:
+            if self._find_value(name, "field_of_view") is None:
                 raise ValueProblem(f"needs field_of_view, or one in streams.{name}", "missing_key")
         if self.depth_sensor is not None and self.depth_sensor.kind == "stereo" and self.baseline <= 0.0:
             message = "stereo: streams.infrared_right needs a position, to the right of that of streams.depth"
@@ -383,18 +385,18 @@ class CameraModel(Strict):
 
     def stream(self, name: str) -> CompleteStream:
         """Return all values of one stream; those of colour for a stream that the camera lacks. Raises Unknown."""
-        view = self._of(name, "field_of_view")
+        view = self._find_value(name, "field_of_view")
         if view is None:
             raise Unknown("field_of_view")  # only in a model with problems
         return CompleteStream(
-            self._of(name, "modes"),
-            self._of(name, "formats"),
+            self._find_value(name, "modes"),
+            self._find_value(name, "formats"),
             view,
-            self._of(name, "position") or (0.0, 0.0, 0.0),
-            self._of(name, "orientation") or (0.0, 0.0, 0.0, 1.0),
+            self._find_value(name, "position") or (0.0, 0.0, 0.0),
+            self._find_value(name, "orientation") or (0.0, 0.0, 0.0, 1.0),
         )
 
-    def _of(self, name: str, key: str) -> Any:
+    def _find_value(self, name: str, key: str) -> Any:
         place: str | None = name if name in self.streams else "color"
         while place is not None:
             own = getattr(self.streams.get(place), key, None)  # type: ignore[call-overload]  # any name is allowed
@@ -438,7 +440,7 @@ def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Pa
     there = list_data(folder, *parts)
     if name not in there:
         kind = (folder, *parts)[-1].removesuffix("s")
-        return f"there is no {kind} model {name!r}{nearest(name, there)}, or a path to your own"
+        return f"there is no {kind} model {name!r}{suggest(name, there)}, or a path to your own"
     return data_folder(folder).joinpath(*parts, f"{name}.yaml")
 
 

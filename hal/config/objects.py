@@ -15,7 +15,7 @@ from ..kinematics.urdf import UrdfModel
 from ..specs import BodySpec, RangesSpec, Vector3
 from .context import Context, find_mesh, load_urdf
 from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, nearest, read_yaml, validate
+from .files import Problems, read_yaml, suggest, validate
 from .models import FileSource
 from .schema import (
     Factor,
@@ -41,7 +41,7 @@ __all__ = ["CarriedBy", "ObjectConfig", "RandomPose", "load_objects"]
 _ENDS = "the least and the greatest"
 
 
-def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+def _check_order(ends: tuple[float, float]) -> tuple[float, float]:
     least, greatest = ends
     if least > greatest:
         raise ValueProblem(f"must be {_ENDS}; {least:g} is above {greatest:g}", "empty_range")
@@ -49,8 +49,8 @@ def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
 
 
 _Two = tuple[float, float]
-Range = Annotated[_Two, Several(Quantity("m", -50.0, 50.0), 2, _ENDS), AfterValidator(_ordered)]
-Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, _ENDS), AfterValidator(_ordered)]
+Range = Annotated[_Two, Several(Quantity("m", -50.0, 50.0), 2, _ENDS), AfterValidator(_check_order)]
+Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, _ENDS), AfterValidator(_check_order)]
 
 
 class RandomPose(Strict):
@@ -66,12 +66,12 @@ class RandomPose(Strict):
     yaw_deg: Turn | None = None
 
     @model_validator(mode="after")
-    def _something(self) -> RandomPose:
+    def _check_ranges(self) -> RandomPose:
         if all(getattr(self, key) is None for key in type(self).model_fields):
             raise ValueProblem(f"has no range; keys: {', '.join(type(self).model_fields)}", "missing_key")
         return self
 
-    def around(self, position: Vector3) -> RangesSpec:
+    def place_around(self, position: Vector3) -> RangesSpec:
         """Return the ranges of an object whose configured position is ``position`` (3,), m."""
         places = [given or (value, value) for given, value in zip((self.x, self.y, self.z), position, strict=True)]
         turns = [given or (0.0, 0.0) for given in (self.roll_deg, self.pitch_deg, self.yaw_deg)]
@@ -139,30 +139,30 @@ class ObjectConfig(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _shorthands(cls, data: Any) -> Any:
+    def _expand_shorthand(cls, data: Any) -> Any:
         shape = next((key for key in ("urdf", "mesh") if isinstance(data, dict) and key in data), None)
         return data if shape is None else {"shape": shape, **data}
 
     @model_validator(mode="after")
-    def _sizes(self) -> ObjectConfig:
+    def _check_sizes(self) -> ObjectConfig:
         needed = SIZES[self.shape]
-        given = [key for key in ("half_extents", "radius", "length", "mesh", "urdf") if getattr(self, key) is not None]
-        missing, extra = [k for k in needed if k not in given], [k for k in given if k not in needed]
-        if missing or extra:
-            keys = ", ".join(needed) or "no size"
-            wrong = [*(f"{key} is missing" for key in missing), *(f"{key} does not apply" for key in extra)]
-            code = "missing_key" if missing else "conflict"
-            raise ValueProblem(f"a {self.shape} has {keys}: {', '.join(wrong)}", code)
-        if self.mass is not None and self.shape == "urdf":
-            raise ValueProblem("mass does not apply to a urdf, which has its own", "conflict")
-        if self.scale is not None and self.shape not in ("urdf", "mesh"):
-            raise ValueProblem(f"scale applies to a urdf or a mesh; a {self.shape} has its size in m", "conflict")
-        if self.parts and self.shape != "mesh":
-            raise ValueProblem(f"parts applies to a mesh only, not to a {self.shape}", "conflict")
-        if self.shape == "plane" and (self.attached is not None or self.random is not None):
-            raise ValueProblem("a plane is infinite; it cannot have attached or random", "conflict")
-        if self.random is not None and self.attached is not None:
-            raise ValueProblem("attached and random exclude each other: the object is where the arm is", "conflict")
+        wrong = [f"{key} is missing" for key in needed if getattr(self, key) is None]
+        code = "missing_key" if wrong else "conflict"
+        others = [key for key in ("half_extents", "radius", "length", "mesh", "urdf") if key not in needed]
+        wrong += [f"{key} does not apply" for key in others if getattr(self, key) is not None]
+        if wrong:
+            raise ValueProblem(f"a {self.shape} has {', '.join(needed) or 'no size'}: {', '.join(wrong)}", code)
+        moves = self.attached is not None, self.random is not None
+        conflicts = {
+            "mass does not apply to a urdf, which has its own": self.mass is not None and self.shape == "urdf",
+            f"scale applies to a urdf or a mesh; a {self.shape} has its size in m": self.scale is not None
+            and self.shape not in ("urdf", "mesh"),
+            f"parts applies to a mesh only, not to a {self.shape}": self.parts and self.shape != "mesh",
+            "a plane is infinite; it cannot have attached or random": self.shape == "plane" and any(moves),
+            "attached and random exclude each other: the object is where the arm is": all(moves),
+        }
+        if text := next((text for text, there in conflicts.items() if there), None):
+            raise ValueProblem(text, "conflict")
         return self
 
 
@@ -200,7 +200,7 @@ def load_objects(context: Context) -> tuple[BodySpec, ...]:
             if config.attached is not None:
                 _check_attached(context, config.attached, robots, file, f"{prefix}attached")
         if not problems.found:
-            bodies.append(_body(config, urdf, mesh, context.links))
+            bodies.append(_make_body(config, urdf, mesh, context.links))
     return tuple(bodies)
 
 
@@ -212,26 +212,9 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
         entry = entry["file"]
     if isinstance(entry, dict):
         return validate(ObjectConfig, entry, source, problems, key), source, key
-    if not isinstance(entry, str):
-        message = f"must be a file, a name or keys and values, not {describe(entry)}"
-        problems.add(source, key, message, "wrong_type")
-        return None
-    if is_path(entry):
-        path = user_path(entry, base)
-        if not os.path.isfile(path):
-            there = [f"{path.parent.name}/{p.name}" for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            hint = nearest(f"{path.parent.name}/{path.name}", there)
-            problems.add(source, key, f"there is no file {path}{hint}", "missing_file")
-            return None
-    else:
-        there = list(list_data("config", "objects"))
-        if entry not in there:
-            message = f"there is no object {entry!r}{nearest(entry, there)}, or a path to your own"
-            problems.add(source, key, message, "unknown_object")
-            return None
-        path = data_folder("config") / "objects" / f"{entry}.yaml"
-    data = read_yaml(path, problems)
-    if data is None:
+    path = _find_file(entry, source, base, key, problems)
+    data = read_yaml(path, problems) if path is not None else None
+    if path is None or data is None:
         return None
     config = validate(ObjectConfig, data, path, problems)
     if not changes:
@@ -250,17 +233,38 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
     return changed, str(path), ""
 
 
+def _find_file(entry: object, source: str, base: Path, key: str, problems: Problems) -> Path | None:
+    """Return the file of an object; None, with the problem added, if there is none."""
+    if not isinstance(entry, str):
+        message, code = f"must be a file, a name or keys and values, not {describe(entry)}", "wrong_type"
+    elif is_path(entry):
+        path = user_path(entry, base)
+        if os.path.isfile(path):  # unlike Path.is_file, it has no error for names that are too long
+            return path
+        there = [f"{path.parent.name}/{found.name}" for found in path.parent.glob("*.yaml")]
+        hint = suggest(f"{path.parent.name}/{path.name}", there)
+        message, code = f"there is no file {path}{hint}", "missing_file"
+    else:
+        there = list(list_data("config", "objects"))
+        if entry in there:
+            return data_folder("config") / "objects" / f"{entry}.yaml"
+        message = f"there is no object {entry!r}{suggest(entry, there)}, or a path to your own"
+        code = "unknown_object"
+    problems.add(source, key, message, code)
+    return None
+
+
 def _check_attached(context: Context, carried: CarriedBy, robots: tuple[str, ...], file: str, key: str) -> None:
     if carried.robot not in robots:
-        text = f"this rig has no robot {carried.robot!r}{nearest(carried.robot, robots)}"
+        text = f"this rig has no robot {carried.robot!r}{suggest(carried.robot, robots)}"
         context.problems.add(file, f"{key}.robot", text, "unknown_device")
     urdf, others = context.urdfs.get(carried.robot), context.links.get(carried.robot, {})
     if urdf is not None and carried.link not in urdf.links and carried.link not in others:
-        text = f"robot {carried.robot!r} has no link {carried.link!r}{nearest(carried.link, (*urdf.links, *others))}"
+        text = f"robot {carried.robot!r} has no link {carried.link!r}{suggest(carried.link, (*urdf.links, *others))}"
         context.problems.add(file, f"{key}.link", text, "unknown_link")
 
 
-def _body(
+def _make_body(
     config: ObjectConfig, urdf: UrdfModel | None, mesh: Path | None, links: Mapping[str, Mapping[str, str]]
 ) -> BodySpec:
     carried = config.attached
@@ -288,5 +292,5 @@ def _body(
         visible=config.visible,
         robot=carried.robot if carried is not None else None,
         link=links.get(carried.robot, {}).get(carried.link, carried.link) if carried is not None else None,
-        random=config.random.around(position) if config.random is not None else None,
+        random=config.random.place_around(position) if config.random is not None else None,
     )

@@ -22,7 +22,7 @@ from ..pads.model import pad_model
 from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RobotSpec, WorldSpec
 from .context import Context
 from .data_files import user_path
-from .files import nearest, read_yaml
+from .files import read_yaml, suggest
 from .models import find_model, load_pad_models
 from .objects import load_objects
 from .resolve_cameras import resolve_camera
@@ -43,21 +43,23 @@ def resolve(context: Context) -> Plan:
     """Return the plan. Raises ConfigError with every problem, those that were added before as well."""
     rig = context.rig
     _check_names(context)
-    robots = _each(context, "robots", resolve_robot)
-    cameras = _each(context, "cameras", resolve_camera)
-    pads = _each(context, "gamepads", resolve_pad)
+    robots = _resolve_all(context, "robots", resolve_robot)
+    cameras = _resolve_all(context, "cameras", resolve_camera)
+    pads = _resolve_all(context, "gamepads", resolve_pad)
     with suppress(Unknown):
         _check_clock(context)
     _check_rates(context, robots)
     _check_places(context, robots)
-    driver = _world_driver(context)
+    driver: str | None = None
+    with suppress(Unknown):
+        driver = _world_driver(context)
     bodies: tuple[BodySpec, ...] = ()
     with suppress(Unknown):
         bodies = load_objects(context)  # for a real rig, too, so that mistakes in objects are found there
     boxes: tuple[BoxSpec, ...] = ()
     with suppress(Unknown):
-        boxes = tuple(_boxes(context, bodies))
-        context.warnings += _unguarded(bodies, boxes)
+        boxes = tuple(_collect_boxes(context, bodies))
+        context.warnings += _warn_of_unguarded(bodies, boxes)
     context.problems.raise_any()
     wanted = rig.collisions
     physics = rig.simulation
@@ -76,7 +78,7 @@ def resolve(context: Context) -> Plan:
     )
 
 
-def _boxes(context: Context, bodies: Iterable[BodySpec]) -> Iterator[BoxSpec]:
+def _collect_boxes(context: Context, bodies: Iterable[BodySpec]) -> Iterator[BoxSpec]:
     """Yield the boxes that no arm may touch; those of an object of the rig have its name."""
     objects = {body.name: body for body in bodies}
     for k, box in enumerate(context.rig.collisions.boxes):
@@ -84,13 +86,13 @@ def _boxes(context: Context, bodies: Iterable[BodySpec]) -> Iterator[BoxSpec]:
         if box.position is not None and box.size is not None:
             yield BoxSpec(box.name, box.position, box.orientation, box.size)
         elif box.name in objects:
-            yield from _boxes_of(context, key, objects[box.name])
+            yield from _split_object(context, key, objects[box.name])
         elif not context.problems.found:  # else it may be one whose file is wrong
-            message = f"there is no object {box.name!r}{nearest(box.name, objects)}; a box needs position and size"
-            context.problem(key, message, "unknown_object")
+            message = f"there is no object {box.name!r}{suggest(box.name, objects)}; a box needs position and size"
+            context.report(key, message, "unknown_object")
 
 
-def _unguarded(bodies: Iterable[BodySpec], boxes: Iterable[BoxSpec]) -> Iterator[str]:
+def _warn_of_unguarded(bodies: Iterable[BodySpec], boxes: Iterable[BoxSpec]) -> Iterator[str]:
     """Yield a warning for each object that stands fixed in the way and that no box stands for."""
     named = {box.name for box in boxes}
     for body in bodies:
@@ -102,7 +104,7 @@ def _is_fixed(body: BodySpec) -> bool:
     return body.robot is None and (body.fixed or (body.urdf is None and body.mass == 0.0))
 
 
-def _boxes_of(context: Context, key: str, body: BodySpec) -> Iterator[BoxSpec]:
+def _split_object(context: Context, key: str, body: BodySpec) -> Iterator[BoxSpec]:
     """Yield the boxes of an object, which must be fixed and consist of boxes."""
     pose = Pose(body.position, body.orientation)
     shapes: list[tuple[Pose, tuple[float, ...]]] = []
@@ -119,10 +121,10 @@ def _boxes_of(context: Context, key: str, body: BodySpec) -> Iterator[BoxSpec]:
         message = (
             f"the collision shapes of {body.name!r} are not boxes: give name, position and size of a box around it"
         )
-        context.problem(key, message, "wrong_shape")
+        context.report(key, message, "wrong_shape")
         return
     if not _is_fixed(body):
-        context.problem(key, f"{body.name!r} can move: only objects that are fixed can be given here", "wrong_shape")
+        context.report(key, f"{body.name!r} can move: only objects that are fixed can be given here", "wrong_shape")
         return
     for at, size in shapes:
         position, orientation = at.position.tolist(), at.orientation.tolist()
@@ -135,33 +137,58 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
     model: dict[str, Any] | None = None
     with suppress(Unknown):
         model = _pad_model(context, key, config)
-    if context.driver is None:
+    driver, real = context.driver, False
+    if driver is None:
         with suppress(Unknown):
-            if config.driver == CHOSEN_LATER or context.check_driver(config.driver, "gamepad", f"{key}.driver"):
-                _check_recording(context, f"{key}.file", config)
+            driver, real = _pad_driver(context, key, config), config.sim is False
+            if driver is not None:
+                _check_recording(context, f"{key}.file", config, driver)
     with suppress(Unknown):
         if config.drives is not None and config.drives not in context.rig.robots:
-            message = f"there is no robot {config.drives!r}{nearest(config.drives, context.rig.robots)}"
-            context.problem(f"{key}.drives", message, "unknown_robot")
+            message = f"there is no robot {config.drives!r}{suggest(config.drives, context.rig.robots)}"
+            context.report(f"{key}.drives", message, "unknown_robot")
     models = tuple(load_pad_models(context.problems).values())
-    if context.problems.found:
+    if context.problems.found or driver is None:
         return None
     options = dict(config.options)
     if config.file is not None:
         options["file"] = str(user_path(config.file, context.base))
     spec = PadSpec(
         name=name,
-        driver=context.driver or config.driver,
+        driver=driver,
         model=model,
         models=models,
         dead_zone=config.dead_zone,
         drives=config.drives,
         options=options,
+        real=real,
     )
     if spec.driver != CHOSEN_LATER:
         for relative, message, code in registry.checked(spec.driver, "gamepad", spec):
-            context.problem(f"{key}.{relative}", message, code)
+            context.report(f"{key}.{relative}", message, code)
     return spec
+
+
+def _pad_driver(context: Context, key: str, config: PadConfig) -> str | None:
+    """Return the driver of a gamepad by its ``driver`` and its flag; None, and the problem, if there is no such driver.
+
+    The problem is added, too, if the two contradict each other.
+    """
+    program, recording = registry.pad_driver("program"), registry.pad_driver("recording")
+    if config.driver == CHOSEN_LATER:
+        if not config.sim:
+            return CHOSEN_LATER
+        if config.file is None and config.options:
+            context.report(f"{key}.options", "are for a recording, and no file names one", "conflict")
+        return program if config.file is None else recording
+    if not context.check_driver(config.driver, "gamepad", f"{key}.driver"):
+        return None
+    known = registry.driver(config.driver).pad_input is not None
+    if known and config.sim is not None and config.sim != (config.driver in (program, recording)):
+        kind = "a real pad" if config.sim else "a simulated pad"
+        message = f"is {str(config.sim).lower()}, and the driver {config.driver!r} is {kind}: leave one of the two out"
+        context.report(f"{key}.sim", message, "conflict")
+    return config.driver
 
 
 def _pad_model(context: Context, key: str, config: PadConfig) -> dict[str, Any] | None:
@@ -169,7 +196,7 @@ def _pad_model(context: Context, key: str, config: PadConfig) -> dict[str, Any] 
         return None
     found = find_model(config.model, "sensors", ("gamepads",), context.base)
     if isinstance(found, str):
-        context.problem(f"{key}.model", f"{found}, or auto", "unknown_model")
+        context.report(f"{key}.model", f"{found}, or auto", "unknown_model")
         return None
     data = read_yaml(found, context.problems)
     if data is not None:
@@ -181,19 +208,21 @@ def _pad_model(context: Context, key: str, config: PadConfig) -> dict[str, Any] 
     return data
 
 
-def _check_recording(context: Context, key: str, config: PadConfig) -> None:
-    plays = config.driver != CHOSEN_LATER and registry.driver(config.driver).pad_input == "recording"
-    if not plays:
+def _check_recording(context: Context, key: str, config: PadConfig, driver: str) -> None:
+    if driver != registry.pad_driver("recording"):
         if config.file is not None:
-            message = f"is for the driver {registry.pad_driver('recording')}, not {config.driver!r}"
-            context.problem(key, message, "conflict")
+            own = "sim is false" if config.sim is False else f"the driver is {driver!r}"
+            message = f"is what a simulated pad plays (sim: true), and {own} here"
+            context.report(key, message, "conflict")
     elif config.file is None:
-        context.problem(key, "is missing: the recording to play", "missing_key")
+        context.report(key, "is missing: the recording to play", "missing_key")
     elif not os.path.isfile(path := user_path(config.file, context.base)):
-        context.problem(key, f"there is no file {path}", "missing_file")
+        context.report(key, f"there is no file {path}", "missing_file")
 
 
-def _each(context: Context, section: str, make: Callable[[Context, str, Config], Spec | None]) -> tuple[Spec, ...]:
+def _resolve_all(
+    context: Context, section: str, make: Callable[[Context, str, Config], Spec | None]
+) -> tuple[Spec, ...]:
     configs: dict[str, Config] = getattr(context.rig, section, {})
     specs = [make(context, name, config) for name, config in configs.items()]
     return tuple(spec for spec in specs if spec is not None)
@@ -206,7 +235,7 @@ def _check_names(context: Context) -> None:
             key = f"{section}.{name}"
             if name in taken:
                 message = f"{taken[name]} has the same name; names of devices must be unique"
-                context.problem(key, message, "duplicate_name")
+                context.report(key, message, "duplicate_name")
             taken.setdefault(name, key)
 
 
@@ -218,14 +247,14 @@ def _check_clock(context: Context) -> None:
         for name, config in devices.items():
             with suppress(Unknown):
                 key = f"{section}.{name}"
-                if context.simulated(config):
+                if context.is_simulated(config):
                     continue
                 if key in context.real_time_only:
                     text = "is emulated on a bus, where time cannot be stepped: use the clock real_time, or simulate it"
-                    context.problem(key, text, "emulated_in_lock_step")
+                    context.report(key, text, "emulated_in_lock_step")
                 elif key not in context.emulated:
                     text = "is real, and a real device cannot be stepped: use the clock real_time, or simulate it"
-                    context.problem(key, text, "real_in_lock_step")
+                    context.report(key, text, "real_in_lock_step")
 
 
 def _check_rates(context: Context, robots: Iterable[RobotSpec]) -> None:
@@ -240,7 +269,7 @@ def _check_rates(context: Context, robots: Iterable[RobotSpec]) -> None:
                 f"is {robot.rate_hz:g} Hz, and {other.name!r}, which shares its process, has {other.rate_hz:g} Hz: "
                 "they must be equal"
             )
-            context.problem(f"robots.{robot.name}.rate_hz", message, "unequal_rates")
+            context.report(f"robots.{robot.name}.rate_hz", message, "unequal_rates")
 
 
 def _check_places(context: Context, robots: Iterable[RobotSpec]) -> None:
@@ -249,15 +278,21 @@ def _check_places(context: Context, robots: Iterable[RobotSpec]) -> None:
         several = context.rig.robots[other.name].arm is not None
         if several and one.kinematics.urdf == other.kinematics.urdf and in_one_place(one, other):
             message = f"has the model and the base of robot {one.name!r}: add same: {one.name} if both are arms of one"
-            context.problem(f"robots.{other.name}.same", f"{message} robot, or give it another base", "robots_overlap")
+            context.report(f"robots.{other.name}.same", f"{message} robot, or give it another base", "robots_overlap")
 
 
 def _world_driver(context: Context) -> str | None:
-    """Return the driver of the simulated world that the devices are in; None if there is no simulated device."""
+    """Return the driver of the simulated world that the devices are in; None if there is no simulated device.
+
+    Objects of a simulated rig without arms and cameras are in a world, too.
+    """
     worlds = {key: name for key, name in context.drivers.items() if registry.driver(name).world is not None}
     first = next(iter(worlds.values()), None)
     for key, driver in worlds.items():
         if driver != first:
             message = f"is simulated by {driver!r}, others by {first!r}; a rig has one simulated world"
-            context.problem(key, message, "two_worlds")
+            context.report(key, message, "two_worlds")
+    rig = context.rig
+    if rig.objects and not (rig.robots or rig.cameras) and context.rig_sim and context.driver is None:
+        return context.engine_driver
     return first

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, get_args
 from ..geometry import Pose
 from ..images import Intrinsics, centre_crop, from_field_of_view
 from ..specs import CameraSpec, DepthSensorSpec, SensorSpec, ViewSpec
-from .context import Context, check_camera_spec, options_of
-from .files import nearest
+from .context import Context, check_camera_spec, merge_options
+from .files import suggest
 from .models import CameraModel, Capture
-from .rigfile import CameraConfig, Output, Stream, StreamConfig, view_of
+from .rigfile import CameraConfig, Output, Stream, StreamConfig, make_view
 from .schema import Unknown
 
 __all__ = [
@@ -46,7 +46,7 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
     if streams is None or not driver or _has_problems(context, key, file):
         return None
     with suppress(Unknown):
-        spec = _spec(context, name, config, model, driver, streams, file)
+        spec = _make_spec(context, name, config, model, driver, streams, file)
         check_camera_spec(context, key, spec, config, model, file)
         return spec
     return None
@@ -57,10 +57,10 @@ def _has_problems(context: Context, key: str, file: Path) -> bool:
     return any(f"{found.key}.".startswith(f"{key}.") or found.file == str(file) for found in context.problems.found)
 
 
-def _spec(
+def _make_spec(
     context: Context, name: str, config: CameraConfig, model: CameraModel, driver: str, streams: Streams, file: Path
 ) -> CameraSpec:
-    simulated = context.simulated(config)
+    simulated = context.is_simulated(config)
     reference = streams.reference
     output = config.output or Output(width=reference.width, height=reference.height)
     sensor = model.depth_sensor
@@ -74,25 +74,25 @@ def _spec(
         width=output.width,
         height=output.height,
         rate_hz=min((sensor.rate_hz for sensor in streams.sensors.values()), default=reference.rate_hz),
-        K=_through(reference, output),
+        K=_crop_matrix(reference, output),
         distortion=(0.0,) * 5 if simulated else model.distortion,  # rendered images have none
         depth_min=streams.depth_min,
         depth_max=(config.depth or model.depth).max,
         streams=tuple(config.streams),
-        view=_view(context, config),
-        options=options_of(config, model, simulated, driver, context.base, file),
+        view=_find_view(context, config),
+        options=merge_options(config, model, simulated, driver, context.base, file),
         align=streams.align,
         sensors=streams.sensors,
         depth_sensor=DepthSensorSpec(sensor.kind, sensor.unit, model.baseline) if sensor is not None else None,
-        K_infrared=None if all(_same_view(one, reference) for one in infrared) else _through(infrared[0], output),
+        K_infrared=None if all(_share_view(one, reference) for one in infrared) else _crop_matrix(infrared[0], output),
     )
 
 
-def _same_view(one: SensorSpec, other: SensorSpec) -> bool:
+def _share_view(one: SensorSpec, other: SensorSpec) -> bool:
     return replace(one, rate_hz=0.0, format=None) == replace(other, rate_hz=0.0, format=None)
 
 
-def _through(sensor: SensorSpec, output: Output) -> Any:
+def _crop_matrix(sensor: SensorSpec, output: Output) -> Any:
     """Return the camera matrix (3, 3) of a sensor's images after crop and scaling."""
     (fx, _, cx), (_, fy, cy), _ = sensor.K
     crop = centre_crop(sensor.width, sensor.height, output.width, output.height)
@@ -101,8 +101,8 @@ def _through(sensor: SensorSpec, output: Output) -> Any:
 
 def _check_place(context: Context, key: str, config: CameraConfig) -> None:
     somewhere = config.look_at or config.pose or config.attached
-    if somewhere is None and context.driver is None and context.simulated(config):
-        context.problem(key, "is simulated and has no pose: give look_at, pose or attached", "missing_key")
+    if somewhere is None and context.driver is None and context.is_simulated(config):
+        context.report(key, "is simulated and has no pose: give look_at, pose or attached", "missing_key")
 
 
 def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
@@ -110,47 +110,47 @@ def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
         return
     robot, robots = config.attached.robot, context.rig.robots
     if robot not in robots:
-        message = f"this rig has no robot {robot!r}{nearest(robot, robots)}"
-        context.problem(f"{key}.attached.robot", message, "unknown_device")
+        message = f"this rig has no robot {robot!r}{suggest(robot, robots)}"
+        context.report(f"{key}.attached.robot", message, "unknown_device")
     urdf = context.urdfs.get(robot)  # None if the robot itself has problems
     link, aliases = config.attached.link, context.links.get(robot, {})
     if urdf is not None and link not in urdf.links and link not in aliases:
-        text = f"robot {robot!r} has no link {link!r}{nearest(link, (*urdf.links, *aliases))}"
-        context.problem(f"{key}.attached.link", text, "unknown_link")
+        text = f"robot {robot!r} has no link {link!r}{suggest(link, (*urdf.links, *aliases))}"
+        context.report(f"{key}.attached.link", text, "unknown_link")
 
 
 def _check_adjustable(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
     for part in ("field_of_view", "depth"):
         if not model.adjustable and getattr(config, part, None) is not None:
             text = f"is fixed by model {config.model!r}; only adjustable models leave it to the rig"
-            context.problem(f"{key}.{part}", text, "not_adjustable")
+            context.report(f"{key}.{part}", text, "not_adjustable")
 
 
 def _check_streams(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
     if not config.streams:
-        context.problem(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}", "missing_key")
-    simulated = context.simulated(config)
+        context.report(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}", "missing_key")
+    simulated = context.is_simulated(config)
     allowed = (*model.streams, "segmentation") if simulated else tuple(model.streams)
     for stream in config.streams:
         if stream not in allowed and stream in get_args(Stream):  # others are already problems
             hint = "; only simulated cameras have it" if stream == "segmentation" else ""
             message = f"model {config.model!r} has only {', '.join(allowed)}{hint}"
-            context.problem(f"{key}.streams.{stream}", message, "unknown_stream")
+            context.report(f"{key}.streams.{stream}", message, "unknown_stream")
     drawn = config.streams.get("segmentation")
     if simulated and drawn is not None and drawn.model_fields_set:
-        context.problem(f"{key}.streams.segmentation", "is rendered with the frame and has no options", "conflict")
+        context.report(f"{key}.streams.segmentation", "is rendered with the frame and has no options", "conflict")
 
 
-def _view(context: Context, config: CameraConfig) -> ViewSpec | None:
+def _find_view(context: Context, config: CameraConfig) -> ViewSpec | None:
     if config.look_at is not None:
-        return view_of(config.look_at.pose())
+        return make_view(config.look_at.pose())
     if config.pose is not None:
-        return view_of(Pose(config.pose.position, config.pose.orientation))
+        return make_view(Pose(config.pose.position, config.pose.orientation))
     attached = config.attached
     if attached is None:
         return None
     link = context.links.get(attached.robot, {}).get(attached.link, attached.link)
-    return view_of(attached.optical(), attached.robot, link)
+    return make_view(attached.optical_pose(), attached.robot, link)
 
 
 # Streams: the mode that each one is captured in, and the view of its sensor
@@ -172,27 +172,36 @@ def resolve_streams(context: Context, key: str, config: CameraConfig, model: Cam
     """Return the streams and the view of the frames; None, with the problems added, if there are any."""
     before = len(context.problems.found)
     on = [name for name in config.streams if name != _RENDERED and name in model.streams]
-    captures = _captures(on, config.streams, config.capture or model.capture)
+    captures = _set_captures(on, config.streams, config.capture or model.capture)
     _check_modes(context, key, config, model, captures)
     _check_formats(context, key, config, model, on)
     _check_together(context, key, model, captures)
     align = config.align or ("color" if "color" in on or "depth" not in on else "depth")
-    if config.align is not None and align not in on:
+    if config.align not in (None, *on):
         message = f"is {align}, which is not one of the enabled streams: {', '.join(on)}"
-        context.problem(f"{key}.align", message, "conflict")
+        context.report(f"{key}.align", message, "conflict")
     if len(context.problems.found) > before:
         return None
-    sensors: dict[str, SensorSpec] = {name: _sensor(config, model, name, capture) for name, capture in captures.items()}
+    sensors: dict[str, SensorSpec] = {
+        name: _make_sensor(config, model, name, capture) for name, capture in captures.items()
+    }
     reference = sensors.get(align) or next(iter(sensors.values()), None)
     if reference is None:
-        reference = _sensor(config, model, "color", config.capture or model.capture)
-    depth = captures.get("depth")
-    mode = model.stream("depth").mode(depth) if depth is not None and config.depth is None else None
-    nearest_depth = mode.depth_min if mode is not None else None
-    return Streams(sensors, align, reference, nearest_depth or (config.depth or model.depth).min)
+        reference = _make_sensor(config, model, "color", config.capture or model.capture)
+    return Streams(sensors, align, reference, _find_nearest_depth(config, model, captures.get("depth")))
 
 
-def _captures(on: Sequence[Stream], configs: Mapping[Stream, StreamConfig], default: Capture) -> dict[Stream, Capture]:
+def _find_nearest_depth(config: CameraConfig, model: CameraModel, capture: Capture | None) -> float:
+    """Return the nearest depth, m: the rig's, else that of the mode, else the model's."""
+    if config.depth is not None:
+        return config.depth.min
+    mode = model.stream("depth").mode(capture) if capture is not None else None
+    return (mode.depth_min if mode is not None else None) or model.depth.min
+
+
+def _set_captures(
+    on: Sequence[Stream], configs: Mapping[Stream, StreamConfig], default: Capture
+) -> dict[Stream, Capture]:
     """Return size and rate of each stream. Infrared has those of depth, unless the rig gives it its own."""
     found: dict[Stream, Capture] = {}
     for name in sorted(on, key=[*_ONE_SENSOR, "color"].index):
@@ -214,15 +223,15 @@ def _check_modes(
             text = f"{capture} of {name}; it has: {'; '.join(map(str, modes))}"
             wrong.setdefault(f"{key}.streams.{name}" if own else f"{key}.capture", []).append(text)
     for place, texts in wrong.items():
-        context.problem(place, f"model {config.model!r} has no mode {'. And no mode '.join(texts)}", "unknown_mode")
+        context.report(place, f"model {config.model!r} has no mode {'. And no mode '.join(texts)}", "unknown_mode")
 
 
 def _check_formats(context: Context, key: str, config: CameraConfig, model: CameraModel, on: Sequence[Stream]) -> None:
     for name in on:
         wanted, formats = config.streams[name].format, model.stream(name).formats
         if wanted is not None and formats is not None and wanted not in formats:
-            text = f"model {config.model!r} has no {name} format {wanted!r}{nearest(wanted, formats)}"
-            context.problem(f"{key}.streams.{name}.format", text, "unknown_format")
+            text = f"model {config.model!r} has no {name} format {wanted!r}{suggest(wanted, formats)}"
+            context.report(f"{key}.streams.{name}.format", text, "unknown_format")
 
 
 def _check_together(context: Context, key: str, model: CameraModel, captures: Mapping[Stream, Capture]) -> None:
@@ -230,16 +239,16 @@ def _check_together(context: Context, key: str, model: CameraModel, captures: Ma
     if model.depth_sensor is not None and len(set(made.values())) > 1:
         texts = ", ".join(f"{name} {capture}" for name, capture in made.items())
         message = f"one sensor makes all of these, so they must have one size and one rate: {texts}"
-        context.problem(f"{key}.streams", message, "conflict")
+        context.report(f"{key}.streams", message, "conflict")
         return
     slowest = min((capture.rate_hz for capture in captures.values()), default=0.0)
     if any(abs(capture.rate_hz / slowest - round(capture.rate_hz / slowest)) > 1e-6 for capture in captures.values()):
         texts = ", ".join(f"{name} at {capture.rate_hz:g} Hz" for name, capture in captures.items())
         text = f"{texts}: each rate must be a whole multiple of the slowest, which is that of the frames"
-        context.problem(f"{key}.streams", text, "conflict")
+        context.report(f"{key}.streams", text, "conflict")
 
 
-def _sensor(config: CameraConfig, model: CameraModel, name: Stream, capture: Capture) -> SensorSpec:
+def _make_sensor(config: CameraConfig, model: CameraModel, name: Stream, capture: Capture) -> SensorSpec:
     stream = model.stream(name)
     own = config.streams.get(name)  # None for colour that is off: the view of a segmentation alone
     return SensorSpec(

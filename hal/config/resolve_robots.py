@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from .. import registry
 from ..kinematics.composition import divide_urdf
-from ..kinematics.urdf import TURNING, UrdfModel, read_urdf
+from ..kinematics.urdf import TURNING, UrdfJoint, UrdfModel, read_urdf
 from ..specs import (
     Floats,
     GripperSpec,
@@ -25,8 +25,8 @@ from ..specs import (
     Vector3,
     WorkspaceSpec,
 )
-from .context import Context, check_robot_spec, is_emulated, load_arm, options_of
-from .files import Problems, nearest
+from .context import Context, check_robot_spec, is_emulated, load_arm, merge_options
+from .files import Problems, suggest
 from .models import LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig, WorkspaceConfig
 from .schema import Quantity, Unknown
@@ -59,108 +59,125 @@ DEADLINE_SIMULATED, DEADLINE_REAL = 1.0, 0.3
 """Longest deadline of a command, s."""
 
 
+class _Body(NamedTuple):
+    """An arm's URDF, and the numbers of its joints."""
+
+    robot: UrdfModel
+    """The whole robot, which may have other arms."""
+    arm: UrdfModel
+    """The part of it that is this arm's."""
+    limits: LimitsSpec
+    home: Floats
+    initial: Floats | None
+
+
 def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec | None:
     """Return the record of an arm; None, with the problems added, if there are any."""
     key = f"robots.{name}"
     model, file = context.read_model(RobotModel, key, config, "robots")
-    urdf: UrdfModel | None = None
-    with suppress(Unknown):
-        urdf = load_arm(model, file, context.problems, context.warnings)
-    part: UrdfModel | None = None
-    with suppress(Unknown):
-        if urdf is not None:
-            _check_names(model, urdf, file, context.problems)
-            part = _part_of_robot(context, name, config, model, urdf)
-    if part is not None:
-        context.urdfs[name] = part
-    with suppress(Unknown):
-        context.links[name] = model.links
     simulated = True
     with suppress(Unknown):
-        simulated = context.simulated(config)
+        simulated = context.is_simulated(config)
+    body = _resolve_body(context, name, config, model, file, simulated)
+    with suppress(Unknown):
+        context.links[name] = model.links
     with suppress(Unknown):
         if not simulated and config.tcp_speed not in MOST_REAL_TCP_SPEED:
             message = f"must be {MOST_REAL_TCP_SPEED} on a real arm, not {config.tcp_speed:g}"
-            context.problem(f"{key}.tcp_speed", message, "out_of_range")
-    limits, home, initial = _joint_numbers(context, key, config, model, file, urdf, simulated)
+            context.report(f"{key}.tcp_speed", message, "out_of_range")
     driver = context.choose_driver("robot", key, config, model)
     gripper_driver = _check_gripper(context, f"{key}.gripper", config, model)
     with suppress(Unknown):
         _check_workspace(context, f"{key}.workspace", config)
     with suppress(Unknown):
-        if urdf is not None and part is not None and limits is not None and home is not None and driver:
-            options = options_of(config, model, simulated, driver)
-            base = config.base if config.same is None else context.rig.robots[config.same].base
-            shared = options if driver == gripper_driver else {}
-            gripper = _gripper(context, name, config, model, gripper_driver, shared)
-            real = [] if simulated else [(driver, options)]
-            if gripper is not None and not context.simulated(config.gripper, config):
-                real.append((gripper.driver, gripper.options))
-            spec = RobotSpec(
-                name=name,
-                model=config.model,
-                driver=driver,
-                rate_hz=context.rig.simulation.physics_hz if simulated else config.rate_hz or model.rate_hz,
-                urdf=str(part.path),
-                joints=model.joints,
-                home=home,
-                initial=initial or home,
-                limits=limits,
-                kinematics=_kinematics(model, urdf, limits, home),
-                base_position=base.position,
-                base_orientation=base.orientation,
-                gripper=gripper,
-                workspace=_workspace(config.workspace) if config.workspace is not None else None,
-                payload=_payload(context, key, config, driver, simulated),
-                same=config.same,
-                group=None if simulated else _group_key(driver, options),
-                speed=config.speed,
-                move_speed=config.move_speed,
-                tcp_speed=config.tcp_speed,
-                attended=bool(real),
-                emulated=bool(real) and all(is_emulated(*device) for device in real),
-                deadline_max=DEADLINE_SIMULATED if simulated else DEADLINE_REAL,
-                options=options,
-                source=context.source,
-            )
-            if spec.emulated:
-                context.emulated.add(key)
-                if not all(registry.driver(name).steppable for name, _ in real):
-                    context.real_time_only.add(key)
+        if body is not None and driver:
+            spec = _make_spec(context, name, config, model, body, driver, gripper_driver)
             check_robot_spec(context, key, spec, config, model, file)
             return spec
     return None
 
 
-def _joint_numbers(
-    context: Context,
-    key: str,
-    config: RobotConfig,
-    model: RobotModel,
-    file: Path,
-    urdf: UrdfModel | None,
-    simulated: bool,
-) -> tuple[LimitsSpec | None, Floats | None, Floats | None]:
-    """Return limits, home and initial positions; None for those that are unknown or not given."""
+def _make_spec(
+    context: Context, name: str, config: RobotConfig, model: RobotModel, body: _Body, driver: str, gripper_driver: str
+) -> RobotSpec:
+    """Return the record of an arm, and note in the context if a program stands in for its real devices."""
+    key, simulated = f"robots.{name}", context.is_simulated(config)
+    options = merge_options(config, model, simulated, driver)
+    base = config.base if config.same is None else context.rig.robots[config.same].base
+    shared = options if driver == gripper_driver else {}
+    gripper = _make_gripper(context, name, config, model, gripper_driver, shared)
+    real = [] if simulated else [(driver, options)]
+    if gripper is not None and not context.is_simulated(config.gripper, config):
+        real.append((gripper.driver, gripper.options))
+    emulated = bool(real) and all(is_emulated(*device) for device in real)
+    if emulated:
+        context.emulated.add(key)
+        if not all(registry.driver(name).steppable for name, _ in real):
+            context.real_time_only.add(key)
+    return RobotSpec(
+        name=name,
+        model=config.model,
+        driver=driver,
+        rate_hz=context.rig.simulation.physics_hz if simulated else config.rate_hz or model.rate_hz,
+        urdf=str(body.arm.path),
+        joints=model.joints,
+        home=body.home,
+        initial=body.initial or body.home,
+        limits=body.limits,
+        kinematics=_make_kinematics(model, body),
+        base_position=base.position,
+        base_orientation=base.orientation,
+        gripper=gripper,
+        workspace=_make_workspace(config.workspace) if config.workspace is not None else None,
+        payload=_make_payload(context, key, config, driver, simulated),
+        same=config.same,
+        group=None if simulated else _group_key(driver, options),
+        speed=config.speed,
+        move_speed=config.move_speed,
+        tcp_speed=config.tcp_speed,
+        attended=bool(real),
+        emulated=emulated,
+        deadline_max=DEADLINE_SIMULATED if simulated else DEADLINE_REAL,
+        options=options,
+        source=context.source,
+    )
+
+
+def _resolve_body(
+    context: Context, name: str, config: RobotConfig, model: RobotModel, file: Path, simulated: bool
+) -> _Body | None:
+    """Return an arm's URDF and the numbers of its joints; None, with the problems added, if one is unknown."""
+    key = f"robots.{name}"
+    robot: UrdfModel | None = None
+    arm: UrdfModel | None = None
     limits: LimitsSpec | None = None
     home: Floats | None = None
     initial: Floats | None = None
     with suppress(Unknown):
+        robot = load_arm(model, file, context.problems, context.warnings)
+        if robot is not None:
+            _check_names(model, robot, file, context.problems)
+            arm = _divide_robot(context, name, config, model, robot)
+            if arm is not None:
+                context.urdfs[name] = arm
+    with suppress(Unknown):
         where = context.source, f"{key}.limits"
-        limits = resolve_limits(model, urdf, file, config, *where, not simulated, context.problems)
+        limits = resolve_limits(model, robot, file, config, *where, not simulated, context.problems)
     with suppress(Unknown):
         home = spread(model.home, len(model.joints), file, "home", "numbers", context.problems)
         _check_inside(home, limits, model.joints, file, "home", context.problems)
     with suppress(Unknown):
-        initial = _initial(context, f"{key}.initial", model, config)
+        initial = _check_initial(context, f"{key}.initial", model, config)
         _check_inside(initial, limits, model.joints, context.source, f"{key}.initial", context.problems)
-    return limits, home, initial
+    if robot is None or arm is None or limits is None or home is None:
+        return None
+    return _Body(robot, arm, limits, home, initial)
 
 
 # Arms of one robot
 
 
-def _part_of_robot(
+def _divide_robot(
     context: Context, name: str, config: RobotConfig, model: RobotModel, urdf: UrdfModel
 ) -> UrdfModel | None:
     """Return the part of a robot that belongs to one of its arms: all of it, unless the rig has others of its arms.
@@ -169,8 +186,8 @@ def _part_of_robot(
     None, with the problem added, where ``same`` is wrong.
     """
     key, first = f"robots.{name}.same", config.same
-    if first is not None and (problem := _wrong_same(context, name, config, first)):
-        context.problem(key, *problem)
+    if first is not None and (problem := _find_wrong_same(context, name, config, first)):
+        context.report(key, *problem)
         return None
     others = [
         (other, entry)
@@ -181,26 +198,26 @@ def _part_of_robot(
         return urdf
     taken: set[str] = set()
     for other, entry in others:
-        joints = set(_joints_of(context, other, entry))
+        joints = set(_read_joints(context, other, entry))
         if shared := sorted(joints & set(model.joints)):
             if first is not None:  # reported once
                 text = f"robot {other!r} has joint {shared[0]!r} too: arm must be another one"
-                context.problem(f"robots.{name}.arm", text, "conflict")
+                context.report(f"robots.{name}.arm", text, "conflict")
             return None
         taken |= joints
     try:
         return read_urdf(divide_urdf(urdf, model.joints, taken, body=first is None), meshes=False)
     except OSError as error:
-        context.problem(key, f"the part of {urdf.path.name} cannot be written: {error}", "bad_urdf")
+        context.report(key, f"the part of {urdf.path.name} cannot be written: {error}", "bad_urdf")
         return None
 
 
-def _wrong_same(context: Context, name: str, config: RobotConfig, first: str) -> tuple[str, str] | None:
+def _find_wrong_same(context: Context, name: str, config: RobotConfig, first: str) -> tuple[str, str] | None:
     """Return message and code of what is wrong with the arm that ``same`` names; None if nothing is."""
     robots = context.rig.robots
     others = [other for other in robots if other != name]
     if first not in others:
-        return f"this rig has no other robot {first!r}{nearest(first, others)}", "unknown_robot"
+        return f"this rig has no other robot {first!r}{suggest(first, others)}", "unknown_robot"
     if robots[first].same is not None:
         return (
             f"robot {first!r} has same: {robots[first].same} itself; name the one without",
@@ -213,7 +230,7 @@ def _wrong_same(context: Context, name: str, config: RobotConfig, first: str) ->
     return None
 
 
-def _joints_of(context: Context, name: str, config: RobotConfig) -> tuple[str, ...]:
+def _read_joints(context: Context, name: str, config: RobotConfig) -> tuple[str, ...]:
     """Return the joints of another arm of the rig; none where its model has problems, which its own entry reports."""
     quiet = replace(context, problems=Problems())
     with suppress(Unknown):
@@ -221,13 +238,13 @@ def _joints_of(context: Context, name: str, config: RobotConfig) -> tuple[str, .
     return ()
 
 
-def _kinematics(model: RobotModel, urdf: UrdfModel, limits: LimitsSpec, home: Floats) -> KinematicsSpec:
+def _make_kinematics(model: RobotModel, body: _Body) -> KinematicsSpec:
     return KinematicsSpec(
-        urdf=str(urdf.path),
+        urdf=str(body.robot.path),
         joints=model.joints,
-        lower=limits.lower,
-        upper=limits.upper,
-        home=home,
+        lower=body.limits.lower,
+        upper=body.limits.upper,
+        home=body.home,
         base_link=model.base_link,
         tcp_link=model.tcp.link,
         tcp_position=model.tcp.position,
@@ -273,7 +290,7 @@ def _check_joints(names: tuple[str, ...], key: str, urdf: UrdfModel, file: Path,
     movable = [name for name, joint in urdf.joints.items() if joint.movable]
     for k, name in enumerate(names):
         if name not in urdf.joints:
-            message = f"{urdf.path.name} has no joint {name!r}{nearest(name, movable)}"
+            message = f"{urdf.path.name} has no joint {name!r}{suggest(name, movable)}"
             problems.add(file, f"{key}.{k}", message, "unknown_joint")
         elif name not in movable:
             message = f"joint {name!r} is {urdf.joints[name].kind}; movable joints: {', '.join(movable)}"
@@ -294,7 +311,7 @@ def _check_chain(model: RobotModel, urdf: UrdfModel, file: Path, problems: Probl
 
 def _check_link(link: str, key: str, urdf: UrdfModel, file: Path, problems: Problems) -> None:
     if link not in urdf.links:
-        problems.add(file, key, f"{urdf.path.name} has no link {link!r}{nearest(link, urdf.links)}", "unknown_link")
+        problems.add(file, key, f"{urdf.path.name} has no link {link!r}{suggest(link, urdf.links)}", "unknown_link")
 
 
 # Limits and positions of the joints
@@ -332,7 +349,7 @@ def resolve_limits(
             if getattr(model.limits, name, ()) is None:
                 text = f"is missing: {UNITS[name]}, one number for each joint or one for all; a URDF does not have it"
                 problems.add(file, f"limits.{name}", text, "missing_key")
-    limits = {name: _of_model(model, urdf, name, file, problems) for name in UNITS}
+    limits = {name: _read_limits(model, urdf, name, file, problems) for name in UNITS}
     _check_order(limits, model.joints, file, "limits", problems)
     tightened = dict(limits)  # checked in simulation, too, so that mistakes are found there
     with suppress(Unknown):
@@ -429,7 +446,7 @@ def _check_order(
     limits["lower"], limits["upper"] = tuple(lower), tuple(upper)
 
 
-def _of_model(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, problems: Problems) -> Floats | None:
+def _read_limits(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, problems: Problems) -> Floats | None:
     n = len(model.joints)
     unknown = (math.nan,) * n
     with suppress(Unknown):
@@ -437,35 +454,33 @@ def _of_model(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, 
         if own is not None:
             return spread(own, n, file, f"limits.{name}", UNITS[name], problems, one_for_all=True) or unknown
         if urdf is not None and name not in ("acceleration", "jerk"):
-            return _from_urdf(model, urdf, name, file, problems)
+            return _read_urdf_limits(model, urdf, name, file, problems)
     return unknown
 
 
-def _from_urdf(model: RobotModel, urdf: UrdfModel, name: str, file: Path, problems: Problems) -> Floats | None:
-    joints = [urdf.joints.get(joint) for joint in model.joints]
-    if name == "torque":
-        efforts = [joint.effort for joint in joints if joint is not None and joint.effort and joint.effort > 0.0]
-        # In many files an effort of 0 means "unknown".
-        return tuple(efforts) if len(efforts) == len(joints) else None
-    values: list[float] = []
-    lacking: list[str] = []
-    for joint in joints:
-        value: float | None = getattr(joint, name, None)
-        if joint is None or not joint.movable:  # already a problem of the names
-            value = math.nan
-        elif value is None and joint.kind == "continuous" and name in ("lower", "upper"):
-            value = math.copysign(ENDLESS, -1.0 if name == "lower" else 1.0)
-        elif value is None or (name == "velocity" and value <= 0.0):
-            lacking.append(joint.name)
-            value = math.nan
-        values.append(value)
+def _read_urdf_limits(model: RobotModel, urdf: UrdfModel, name: str, file: Path, problems: Problems) -> Floats | None:
+    values = [_read_joint_limit(urdf.joints.get(joint), name) for joint in model.joints]
+    lacking = [repr(joint) for joint, value in zip(model.joints, values, strict=True) if value is None]
+    if lacking and name == "torque":
+        return None
     if lacking:
-        text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(map(repr, lacking))}"
+        text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(lacking)}"
         problems.add(file, f"limits.{name}", text, "missing_key")
-    return tuple(values)
+    return tuple(math.nan if value is None else value for value in values)
 
 
-def _initial(context: Context, key: str, model: RobotModel, config: RobotConfig) -> Floats | None:
+def _read_joint_limit(joint: UrdfJoint | None, name: str) -> float | None:
+    """Return a limit from a joint's URDF: None without one, NaN for a joint that does not move."""
+    if joint is None or not joint.movable:  # already a problem of the names
+        return math.nan
+    value: float | None = getattr(joint, "effort" if name == "torque" else name)
+    if name in ("lower", "upper"):
+        endless = value is None and joint.kind == "continuous"
+        return math.copysign(ENDLESS, -1.0 if name == "lower" else 1.0) if endless else value
+    return value if value is not None and value > 0.0 else None  # in many files an effort of 0 means "unknown"
+
+
+def _check_initial(context: Context, key: str, model: RobotModel, config: RobotConfig) -> Floats | None:
     given, n = config.initial, len(model.joints)
     if given is None or len(given) == n:
         return given
@@ -475,7 +490,7 @@ def _initial(context: Context, key: str, model: RobotModel, config: RobotConfig)
         context.warnings.append(message)
         return given[:n]
     message = f"must be {n} numbers, one for each of {', '.join(model.joints)}, not {len(given)}"
-    context.problem(key, message, "wrong_count")
+    context.report(key, message, "wrong_count")
     return None
 
 
@@ -497,13 +512,13 @@ def _check_inside(
 # Payload, process, gripper and workspace
 
 
-def _payload(context: Context, key: str, config: RobotConfig, driver: str, simulated: bool) -> PayloadSpec | None:
+def _make_payload(context: Context, key: str, config: RobotConfig, driver: str, simulated: bool) -> PayloadSpec | None:
     """Return the payload; one that the driver of a real arm cannot use is a problem."""
     if config.payload is None:
         return None
     if not simulated and not registry.driver(driver).payload:
         message = f"cannot be used by the driver {driver!r}: remove it, or give the load in the arm's own settings"
-        context.problem(f"{key}.payload", message, "unused_payload")
+        context.report(f"{key}.payload", message, "unused_payload")
     return PayloadSpec(config.payload.mass, config.payload.position)
 
 
@@ -520,33 +535,33 @@ def _check_gripper(context: Context, key: str, config: RobotConfig, model: Robot
         own, kind = config.gripper, model.gripper
         if kind is None:
             if own.model_fields_set:
-                context.problem(key, f"model {config.model!r} has no gripper", "no_gripper")
+                context.report(key, f"model {config.model!r} has no gripper", "no_gripper")
             return ""
         with suppress(Unknown):
             if own.enabled and own.speed is not None and own.speed > kind.speed:
                 message = f"must be at most {kind.speed:g} m/s, the model's, not {own.speed:g}"
-                context.problem(f"{key}.speed", message, "looser_limit")
+                context.report(f"{key}.speed", message, "looser_limit")
         with suppress(Unknown):
             if own.enabled and own.force is not None and own.force > kind.strongest:
                 message = f"must be at most {kind.strongest:g} N, the model's force_max, not {own.force:g}"
-                context.problem(f"{key}.force", message, "looser_limit")
+                context.report(f"{key}.force", message, "looser_limit")
         if own.enabled:
-            if context.simulated(own, config) and not context.simulated(config):
+            if context.is_simulated(own, config) and not context.is_simulated(config):
                 message = "is simulated, but its arm is real: its fingers would be in another world"
-                context.problem(key, message, "two_worlds")
+                context.report(key, message, "two_worlds")
             return context.choose_driver("gripper", key, own, kind, config)
     return ""
 
 
-def _gripper(
+def _make_gripper(
     context: Context, name: str, config: RobotConfig, model: RobotModel, driver: str, arm: Mapping[str, Any]
 ) -> GripperSpec | None:
     """Return the gripper's record; ``arm`` has the arm's options if the same driver runs both."""
     own, kind = config.gripper, model.gripper
     if kind is None or not own.enabled or not driver:
         return None
-    simulated = context.simulated(own, config)
-    options = options_of(own, kind, simulated, driver)
+    simulated = context.is_simulated(own, config)
+    options = merge_options(own, kind, simulated, driver)
     if not simulated:
         shared = registry.driver(driver).shared_options
         options = {**{name: arm[name] for name in shared if name in arm}, **options}
@@ -565,7 +580,7 @@ def _gripper(
     )
 
 
-def _workspace(config: WorkspaceConfig) -> WorkspaceSpec:
+def _make_workspace(config: WorkspaceConfig) -> WorkspaceSpec:
     lower: Vector3 = config.lower or (-FAR, -FAR, -FAR)
     upper: Vector3 = config.upper or (FAR, FAR, FAR)
     if config.table_height is not None:
@@ -576,7 +591,7 @@ def _workspace(config: WorkspaceConfig) -> WorkspaceSpec:
 def _check_workspace(context: Context, key: str, config: RobotConfig) -> None:
     if config.workspace is None:
         return
-    box = _workspace(config.workspace)
+    box = _make_workspace(config.workspace)
     if any(low >= high for low, high in zip(box.lower, box.upper, strict=True)):
         message = f"is empty: lower {list(box.lower)} must be below upper {list(box.upper)}"
-        context.problem(key, message, "empty_range")
+        context.report(key, message, "empty_range")

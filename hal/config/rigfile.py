@@ -25,7 +25,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..registry import explain_engine
 from ..specs import ViewSpec
-from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, SensorStream, by_name
+from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, SensorStream, expand_names
 from .schema import (
     CameraRate,
     Coordinate,
@@ -69,9 +69,9 @@ __all__ = [
     "RobotConfig",
     "SimulationConfig",
     "WorkspaceConfig",
-    "optical_pose",
+    "make_optical_pose",
     "rig_schema",
-    "view_of",
+    "make_view",
 ]
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ class LookAt(Strict):
             turn = rpy_to_matrix(0, 0, roll) @ rpy_to_matrix(0, yaw, 0) @ rpy_to_matrix(-pitch, 0, 0)
             back, up = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
         eye = np.asarray(self.target) + self.distance * (turn @ back)
-        return optical_pose(eye, -(turn @ back), turn @ up)
+        return make_optical_pose(eye, -(turn @ back), turn @ up)
 
 
 _ROTATION = Several(
@@ -110,7 +110,7 @@ _ROTATION = Several(
 )
 
 
-def _three_or_unit(rotation: tuple[float, ...]) -> tuple[float, ...]:
+def _check_rotation(rotation: tuple[float, ...]) -> tuple[float, ...]:
     if len(rotation) not in (3, 4):
         message = f"must be roll, pitch, yaw in rad, or a quaternion x, y, z, w, not {len(rotation)} numbers"
         raise ValueProblem(message, "wrong_count")
@@ -134,35 +134,35 @@ class Attached(Strict):
     robot: str
     link: str
     translation: Offset = (0.0, 0.0, 0.0)
-    rotation: Annotated[tuple[float, ...], _ROTATION, AfterValidator(_three_or_unit)] = (0.0, 0.0, 0.0)
+    rotation: Annotated[tuple[float, ...], _ROTATION, AfterValidator(_check_rotation)] = (0.0, 0.0, 0.0)
     target: Direction = (0.0, 0.0, 1.0)
     up: Direction | None = None
     pose: PoseConfig | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> Attached:
+    def _check_pose(self) -> Attached:
         others = sorted(self.model_fields_set & {"translation", "rotation", "target", "up"})
         if self.pose is not None and others:
             raise ValueProblem(f"pose is complete; it excludes {', '.join(others)}", "conflict")
         return self
 
     @model_validator(mode="after")
-    def _directions(self) -> Attached:
+    def _check_directions(self) -> Attached:
         if self.up is not None and np.linalg.norm(np.cross(self.target, self.up)) < 1e-6:
             raise ValueProblem("up must not be parallel to target", "conflict")
         return self
 
-    def optical(self) -> Pose:
+    def optical_pose(self) -> Pose:
         """Return the pose of the optical frame in the frame of the link."""
         if self.pose is not None:
             return Pose(self.pose.position, self.pose.orientation)
         target = np.asarray(self.target) / np.linalg.norm(self.target)
         up = self.up or ((0.0, 0.0, 1.0) if abs(target[2]) < 0.999 else (1.0, 0.0, 0.0))
         bracket = quaternion_to_matrix(self.rotation) if len(self.rotation) == 4 else rpy_to_matrix(*self.rotation)
-        return optical_pose(self.translation, bracket @ target, bracket @ np.asarray(up))
+        return make_optical_pose(self.translation, bracket @ target, bracket @ np.asarray(up))
 
 
-def optical_pose(position: ArrayLike, forward: Array, up: Array) -> Pose:
+def make_optical_pose(position: ArrayLike, forward: Array, up: Array) -> Pose:
     """Return the pose of an optical frame (x right, y down, z forward).
 
     Args:
@@ -176,7 +176,7 @@ def optical_pose(position: ArrayLike, forward: Array, up: Array) -> Pose:
     return Pose(position, matrix_to_quaternion(np.column_stack([x, np.cross(z, x), z])))
 
 
-def view_of(pose: Pose, robot: str | None = None, link: str | None = None) -> ViewSpec:
+def make_view(pose: Pose, robot: str | None = None, link: str | None = None) -> ViewSpec:
     """Return a camera's pose, in the world or in a link's frame, as the record that drivers get."""
     x, y, z = pose.position.tolist()
     a, b, c, d = pose.orientation.tolist()
@@ -282,7 +282,7 @@ class StreamConfig(Strict):
     rate_hz: CameraRate | None = None
 
     @model_validator(mode="after")
-    def _whole_size(self) -> StreamConfig:
+    def _check_size(self) -> StreamConfig:
         if (self.width is None) != (self.height is None):
             raise ValueProblem("needs width and height, or neither", "missing_key")
         return self
@@ -291,7 +291,7 @@ class StreamConfig(Strict):
 Stream = Literal[SensorStream, "segmentation"]
 
 
-def _color_and_depth() -> dict[Stream, StreamConfig]:
+def _make_default_streams() -> dict[Stream, StreamConfig]:
     return {"color": StreamConfig(), "depth": StreamConfig()}
 
 
@@ -306,8 +306,8 @@ class CameraConfig(Device):
     """Size after a centre crop and scaling; default: the captured size."""
     streams: Annotated[
         dict[Stream, StreamConfig],
-        BeforeValidator(by_name, json_schema_input_type=dict[Stream, StreamConfig | None] | list[Stream]),
-    ] = Field(default_factory=_color_and_depth)
+        BeforeValidator(expand_names, json_schema_input_type=dict[Stream, StreamConfig | None] | list[Stream]),
+    ] = Field(default_factory=_make_default_streams)
     """``{color: {format: bgr8}, ...}`` or just ``[color, depth]``."""
     align: Literal["color", "depth"] | None = None
     """Stream whose view colour and depth are returned in; default: colour's, if there is colour."""
@@ -321,7 +321,7 @@ class CameraConfig(Device):
     """Nearest and farthest depth, m; only for models that leave it to the rig."""
 
     @model_validator(mode="after")
-    def _one_place(self) -> CameraConfig:
+    def _check_place(self) -> CameraConfig:
         given = [key for key in ("look_at", "pose", "attached") if getattr(self, key) is not None]
         if len(given) > 1:
             raise ValueProblem(f"has more than one pose: give one of {', '.join(given)}", "conflict")
@@ -331,12 +331,15 @@ class CameraConfig(Device):
 class PadConfig(Strict):
     """A gamepad."""
 
+    sim: Flag | None = None
+    """``true``: simulated, which the program operates, or which plays ``file``. ``false``: one that a person operates.
+    Default: as ``driver`` says. The rig's flag is for robots and cameras: a real pad drives a simulated arm."""
     model: str = "auto"
     """``auto``, a name in ``sensors/gamepads/``, or the path of a file of your own."""
     driver: str = "auto"
     """``auto``, ``evdev``, ``web``, ``terminal``, ``playback`` or another driver."""
     file: str | None = None
-    """Recording for the driver ``playback``."""
+    """Recording for a simulated pad, the driver ``playback``."""
     drives: str | None = None
     """Arm that this pad drives where several arms are driven at once; default: the first that no other pad drives."""
     dead_zone: Annotated[float, Quantity("", 0.0, 0.9)] = 0.08
@@ -379,7 +382,7 @@ class BoxConfig(Strict):
     """Its whole sides, m."""
 
     @model_validator(mode="after")
-    def _whole(self) -> BoxConfig:
+    def _check_box(self) -> BoxConfig:
         given = [key for key in ("position", "orientation", "size") if key in self.model_fields_set]
         missing = [key for key in ("position", "size") if key not in given]
         if given and missing:
@@ -387,7 +390,7 @@ class BoxConfig(Strict):
         return self
 
 
-def _box(value: Any) -> Any:
+def _expand_box(value: Any) -> Any:
     return {"name": value} if isinstance(value, str) else value
 
 
@@ -398,7 +401,7 @@ class CollisionsConfig(Strict):
     """Whether an arm must not touch itself."""
     arms: Flag = True
     """Whether the arms must not touch each other."""
-    boxes: list[Annotated[BoxConfig, BeforeValidator(_box, json_schema_input_type=Name | BoxConfig)]] = Field(
+    boxes: list[Annotated[BoxConfig, BeforeValidator(_expand_box, json_schema_input_type=Name | BoxConfig)]] = Field(
         default_factory=list, max_length=DEVICES
     )
     """Boxes that no arm may touch: ``{name, position, size}``, or names of objects of this rig."""
@@ -406,7 +409,7 @@ class CollisionsConfig(Strict):
     """Distance that is kept, m."""
 
 
-def _objects(value: Any) -> Any:
+def _check_objects(value: Any) -> Any:
     if value is None:  # "objects:" without a value
         return []
     if not isinstance(value, (list, tuple)):
@@ -415,7 +418,7 @@ def _objects(value: Any) -> Any:
     return value
 
 
-def _section(value: Any) -> Any:
+def _fill_section(value: Any) -> Any:
     """Return a section; a key without a value is an empty one."""
     return {} if value is None else value
 
@@ -429,13 +432,13 @@ class RigFile(Strict):
     description: str = ""
     sim: Flag = True
     """Whether every device without a flag of its own is simulated."""
-    robots: Annotated[dict[Name, RobotConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
-    cameras: Annotated[dict[Name, CameraConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
-    gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
-    objects: Annotated[list[Any], BeforeValidator(_objects)] = Field(default_factory=list, max_length=OBJECTS)
+    robots: Annotated[dict[Name, RobotConfig], BeforeValidator(_fill_section), _FEW] = Field(default_factory=dict)
+    cameras: Annotated[dict[Name, CameraConfig], BeforeValidator(_fill_section), _FEW] = Field(default_factory=dict)
+    gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_fill_section), _FEW] = Field(default_factory=dict)
+    objects: Annotated[list[Any], BeforeValidator(_check_objects)] = Field(default_factory=list, max_length=OBJECTS)
     """Objects of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""
-    collisions: Annotated[CollisionsConfig, BeforeValidator(_section)] = CollisionsConfig()
-    simulation: Annotated[SimulationConfig, BeforeValidator(_section)] = SimulationConfig()
+    collisions: Annotated[CollisionsConfig, BeforeValidator(_fill_section)] = CollisionsConfig()
+    simulation: Annotated[SimulationConfig, BeforeValidator(_fill_section)] = SimulationConfig()
 
 
 def rig_schema() -> dict[str, Any]:

@@ -59,9 +59,9 @@ __all__ = [
     "ViewAngle",
     "describe",
     "is_number",
-    "keys_at",
-    "kind_inside",
-    "record_in",
+    "list_keys",
+    "find_kind",
+    "find_record",
 ]
 
 
@@ -214,7 +214,7 @@ class Several:
         return {"anyOf": [item, several]} if self.single else several
 
 
-def _unit_quaternion(q: tuple[float, ...]) -> tuple[float, ...]:
+def _normalise(q: tuple[float, ...]) -> tuple[float, ...]:
     norm = math.hypot(*q)
     if abs(norm - 1.0) > 0.01:
         raise ValueProblem(
@@ -223,7 +223,7 @@ def _unit_quaternion(q: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(item / norm for item in q)
 
 
-def _with_length(direction: tuple[float, ...]) -> tuple[float, ...]:
+def _check_length(direction: tuple[float, ...]) -> tuple[float, ...]:
     if math.hypot(*direction) < 1e-6:
         raise ValueProblem("must be a direction, of any length but 0", "out_of_range")
     return direction
@@ -258,9 +258,9 @@ Offset = Annotated[_Three, Several(Quantity("m", -5.0, 5.0), 3, "x, y, z")]
 """In the frame of a link or of a sensor."""
 Sizes = Annotated[_Three, Several(Quantity("m", 0.0, 5.0, above=True), 3, "x, y, z")]
 Gravity = Annotated[_Three, Several(Quantity("m/s2", -100.0, 100.0), 3, "x, y, z")]
-Direction = Annotated[_Three, Several(Quantity("", -1e6, 1e6), 3, "x, y, z"), AfterValidator(_with_length)]
+Direction = Annotated[_Three, Several(Quantity("", -1e6, 1e6), 3, "x, y, z"), AfterValidator(_check_length)]
 QuaternionConfig = Annotated[
-    _Four, Several(Quantity("", -1e6, 1e6), 4, "a unit quaternion x, y, z, w"), AfterValidator(_unit_quaternion)
+    _Four, Several(Quantity("", -1e6, 1e6), 4, "a unit quaternion x, y, z, w"), AfterValidator(_normalise)
 ]
 Rgba = Annotated[_Four, Several(Quantity("", 0.0, 1.0), 4, "red, green, blue, alpha")]
 
@@ -298,44 +298,44 @@ class PoseConfig(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _seven_numbers(cls, data: Any) -> Any:
+    def _expand_numbers(cls, data: Any) -> Any:
         if isinstance(data, (list, tuple)):
             seven = _POSE.check(data)
             return {"position": seven[:3], "orientation": seven[3:]}
         return data
 
 
-def keys_at(model: type[BaseModel], loc: Sequence[Any]) -> tuple[str, ...]:
+def list_keys(model: type[BaseModel], loc: Sequence[Any]) -> tuple[str, ...]:
     """Return the keys that are allowed at a place (keys and indices, from the outermost inwards) in a record."""
     kind: Any = model
     for part in loc:
-        kind = kind_inside(kind, part)
-    kind = record_in(kind)
+        kind = find_kind(kind, part)
+    kind = find_record(kind)
     return tuple(kind.model_fields) if kind is not None else ()
 
 
-def kind_inside(kind: Any, part: Any) -> Any:
+def find_kind(kind: Any, part: Any) -> Any:
     """Return the type of the value at ``part`` of a record, a dict or a list of the type ``kind``; None if unknown."""
-    record = record_in(kind)
+    record = find_record(kind)
     if record is not None:
         found = record.model_fields.get(str(part))
         return found.annotation if found is not None else None
-    for option in _options(kind):
+    for option in _list_options(kind):
         arguments = typing.get_args(option)
         if typing.get_origin(option) in (dict, list, tuple) and arguments:
             return arguments[1] if typing.get_origin(option) is dict else arguments[0]
     return None
 
 
-def record_in(kind: Any) -> type[BaseModel] | None:
+def find_record(kind: Any) -> type[BaseModel] | None:
     """Return the class of record that a value of the type ``kind`` is; None if it is not a record."""
-    return next((k for k in _options(kind) if isinstance(k, type) and issubclass(k, BaseModel)), None)
+    return next((k for k in _list_options(kind) if isinstance(k, type) and issubclass(k, BaseModel)), None)
 
 
-def _options(kind: Any) -> tuple[Any, ...]:
+def _list_options(kind: Any) -> tuple[Any, ...]:
     """Return the types in ``X | None`` and ``Annotated[X, ...]``: X."""
     if typing.get_origin(kind) is Annotated:
-        return _options(typing.get_args(kind)[0])
+        return _list_options(typing.get_args(kind)[0])
     if type(None) in typing.get_args(kind):
-        return tuple(inner for option in typing.get_args(kind) for inner in _options(option))
+        return tuple(inner for option in typing.get_args(kind) for inner in _list_options(option))
     return (kind,)

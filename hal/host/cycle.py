@@ -30,7 +30,7 @@ from ..specs import GroupSpec, RobotSpec
 from ..types import RobotStatus
 from .gripper_unit import GripperUnit
 from .guards import guard_arms
-from .mirrors import mirrors_of
+from .mirrors import make_mirrors
 from .records import AppRecord, GroupMemory, RobotMail, ServoRecord
 
 __all__ = [
@@ -160,7 +160,7 @@ class ArmUnit:
         said = self.mail.get_session()
         if said.session != self._session:
             self.servo.close_session()
-        if self.error is not None or self.reading is None or self._drives_went_off(self.reading):
+        if self.error is not None or self.reading is None or self._is_switched_off(self.reading):
             self._setpoint, self._answered = self.servo.device_lost(now, self._inbox(app, said)), False
             return
         ahead = self.servo.answer(now, self.reading)
@@ -173,7 +173,7 @@ class ArmUnit:
             self.reanchored += 1
             self.audit.reset()  # the device's own set-points lie in between
 
-    def _drives_went_off(self, reading: Reading) -> bool:
+    def _is_switched_off(self, reading: Reading) -> bool:
         """Return whether the drives went off without a fault, as by an emergency stop: that trips.
 
         So they come on again only after a new press of the dead-man, or a rearm.
@@ -220,7 +220,7 @@ class ArmUnit:
                 self._lose(error)
         return self._session == 0
 
-    def allowed_session(self, now: float) -> int:
+    def find_session(self, now: float) -> int:
         """Return the session that may move the arm and its gripper at present; 0 for none."""
         return self._session if self.servo.watchdog.allowed else 0
 
@@ -364,7 +364,7 @@ class ArmUnit:
         self.driver.close()
 
 
-def _allowed_elsewhere(memories: Sequence[GroupMemory], name: str, now: float) -> int:
+def _find_allowed(memories: Sequence[GroupMemory], name: str, now: float) -> int:
     """Return the session that may move an arm of another group at ``now`` (s); 0 for none, or if nothing shows it."""
     for memory in memories:
         if name in memory.robots and is_alive(now, memory.get_host().t):
@@ -393,7 +393,7 @@ class Cycle:
         self.spec = spec
         self.memory = memory
         others = list(others)
-        self._mirrors = mirrors_of(spec, others)
+        self._mirrors = make_mirrors(spec, others)
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
         self.t = 0.0
@@ -411,7 +411,7 @@ class Cycle:
         for gripper in spec.grippers:
             driver = registry.load(gripper.driver, "gripper")(gripper, self.world)
             arm = self.arms.get(gripper.arm)
-            allowed = arm.allowed_session if arm is not None else partial(_allowed_elsewhere, others, gripper.arm)
+            allowed = arm.find_session if arm is not None else partial(_find_allowed, others, gripper.arm)
             self.grippers[gripper.name] = GripperUnit(driver, memory.grippers[gripper.name], allowed)
         self._gripper_units = tuple(self.grippers.values())
 
@@ -430,7 +430,7 @@ class Cycle:
         """Whether the group has a real arm."""
         return any(unit.spec.attended for unit in self._arm_units)
 
-    def looping_driver(self) -> RobotDriver | None:
+    def find_looping_driver(self) -> RobotDriver | None:
         """Return a driver whose library needs to own the loop now; None if there is none."""
         return next((unit.driver for unit in self._arm_units if unit.driver.wants_loop), None)
 

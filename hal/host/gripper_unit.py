@@ -140,7 +140,7 @@ class GripperUnit:
 
     def _fail(self, error: Exception) -> None:
         self._note(error)
-        self._end(GripperOutcome.FAILED, _fault_of(error))
+        self._end(GripperOutcome.FAILED, _make_fault(error))
 
     def _end(self, outcome: GripperOutcome, fault: Fault | None = None) -> None:
         self._outcome, self._final, self._fault = outcome, True, fault
@@ -161,7 +161,7 @@ class GripperUnit:
                 raise ConnectionLost(f"{self.spec.name} reports a width of {reading.width}")
         except Exception as error:
             self._note(error)
-            lost = _fault_of(error)
+            lost = _make_fault(error)
         else:
             self._reading = reading
             self._judge(reading)
@@ -177,14 +177,14 @@ class GripperUnit:
         if reading.outcome:
             self._outcome = reading.outcome
         elif not reading.moving and reading.seq != self._seq_before:
-            self._end(_outcome_at_rest(command, reading, self.spec.width_min))
+            self._end(_judge_rest(command, reading, self.spec.width_min))
 
     def close(self) -> None:
         """Close the device; it keeps what it holds."""
         self.driver.close()
 
 
-def _outcome_at_rest(command: GripperCommand, reading: GripperReading, width_min: float) -> GripperOutcome:
+def _judge_rest(command: GripperCommand, reading: GripperReading, width_min: float) -> GripperOutcome:
     beyond = reading.width - command.width
     if command.act is GripperAct.MOVE:
         there = abs(reading.width - max(command.width, width_min)) <= AT_WIDTH
@@ -195,7 +195,7 @@ def _outcome_at_rest(command: GripperCommand, reading: GripperReading, width_min
     return GripperOutcome.DONE if there else GripperOutcome.MISSED
 
 
-def _fault_of(error: Exception) -> Fault:
+def _make_fault(error: Exception) -> Fault:
     if isinstance(error, RobotFault):
         return Fault("gripper", error.cause, error.remedy)
     if isinstance(error, ConnectionLost):

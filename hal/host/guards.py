@@ -53,7 +53,7 @@ class ArmElsewhere:
     def __init__(self, spec: RobotSpec, mail: RobotMail) -> None:
         self._acceleration = spec.limits.acceleration
         self._jerk = spec.limits.jerk
-        self._compliant_jerk = _least_jerk(spec)
+        self._compliant_jerk = _find_jerk(spec)
         self._mail = mail
         self._seen: ServoRecord | None = None
         self._stop: tuple[Floats, Floats] = (spec.initial, spec.initial)
@@ -82,7 +82,7 @@ class ArmElsewhere:
         return self._stop
 
 
-def _least_jerk(spec: RobotSpec) -> Floats:
+def _find_jerk(spec: RobotSpec) -> Floats:
     """Return the jerks (n,), rad/s3, with which an arm's set-point surely stops in a session with a controller."""
     limits = spec.limits
     if limits.torque is None:

@@ -30,14 +30,14 @@ __all__ = [
     "LocalHost",
     "RemoteHost",
     "SteppedHost",
-    "groups_of",
+    "make_groups",
 ]
 
 GRIPPER_HZ = 100.0
 """Rate of a gripper that has a process of its own."""
 
 
-def groups_of(plan: Plan) -> list[GroupSpec]:
+def make_groups(plan: Plan) -> list[GroupSpec]:
     """Return the groups of a rig: the devices of its simulated world together, and each other arm alone.
 
     Arms with the same :attr:`.RobotSpec.group` are one group. A gripper is in the group of its arm, except for one
@@ -66,14 +66,14 @@ def groups_of(plan: Plan) -> list[GroupSpec]:
         robots = inside + tuple(r for r in outside if not r.emulated)
         rate = world.physics_hz if world else max((r.rate_hz for r in outside), default=240.0)
         first = GroupSpec("simulation", clock, rate, robots, world, _grippers(robots), collisions)
-        return _with_neighbours([first, *alone, *apart])
+        return _add_neighbours([first, *alone, *apart])
     groups = []
     if world is not None:
         groups = [GroupSpec("simulation", clock, world.physics_hz, inside, world, _grippers(inside), collisions)]
-    return _with_neighbours(groups + alone + apart)
+    return _add_neighbours(groups + alone + apart)
 
 
-def _with_neighbours(groups: Sequence[GroupSpec]) -> list[GroupSpec]:
+def _add_neighbours(groups: Sequence[GroupSpec]) -> list[GroupSpec]:
     """Return the groups, each with the arms of the others that its own must not touch."""
     return [
         replace(group, neighbours=tuple(r for other in groups if other is not group for r in other.robots))
@@ -303,7 +303,7 @@ class RemoteHost(Host):
 
     def beat(self) -> None:
         if self.forked:
-            raise self._not_ours()
+            raise self._make_fork_error()
         with self._writing:
             self.memory.app.write(time.monotonic(), self.latch.stops)
 
@@ -312,7 +312,7 @@ class RemoteHost(Host):
             self.beat()
 
     @staticmethod
-    def _not_ours() -> HalError:
+    def _make_fork_error() -> HalError:
         text = "this rig belongs to the process that opened it, of which this one is a fork: open a rig of its own here"
         return HalError(text, code="forked")
 
@@ -322,7 +322,7 @@ class RemoteHost(Host):
 
     def check(self) -> None:
         if self.forked:
-            raise self._not_ours()
+            raise self._make_fork_error()
         if self._closed.is_set():
             raise HalError("the rig is closed", code="closed")
         self.child.check()

@@ -63,7 +63,7 @@ class Pace(ABC):
         """Return the present time on the group's clock, s."""
         return time.monotonic()
 
-    def heard(self, app: AppRecord) -> AppRecord:
+    def adjust_heartbeat(self, app: AppRecord) -> AppRecord:
         """Return the app's newest record, with its heartbeat on the group's clock."""
         return app
 
@@ -136,7 +136,7 @@ class StepPace(Pace):
             self._cycle.wait()
         return (self._cycle.ticks + 1) * self._cycle.dt
 
-    def heard(self, app: AppRecord) -> AppRecord:
+    def adjust_heartbeat(self, app: AppRecord) -> AppRecord:
         """Return a record with a heartbeat of now: an app that steps is alive by definition."""
         return AppRecord((self._cycle.ticks + 1) * self._cycle.dt, app.stops)
 
@@ -149,15 +149,15 @@ class SuspensionWatch:
 
     def __init__(self) -> None:
         self._clock = getattr(time, "CLOCK_BOOTTIME", None)
-        self._asleep = self._slept()
+        self._asleep = self._measure_sleep()
 
-    def _slept(self) -> float:
+    def _measure_sleep(self) -> float:
         """Return how long it was suspended since it was started, s; 0 if the system cannot tell."""
         return time.clock_gettime(self._clock) - time.monotonic() if self._clock is not None else 0.0
 
-    def ended(self) -> bool:
+    def was_suspended(self) -> bool:
         """Return whether it was suspended since the last call."""
-        before, self._asleep = self._asleep, self._slept()
+        before, self._asleep = self._asleep, self._measure_sleep()
         return self._asleep - before > _ASLEEP
 
 
@@ -276,7 +276,7 @@ class HostProcess:
     def _cycle_until_closed(self) -> None:
         while not self._is_over():
             self._turn()
-            driver = self.cycle.looping_driver()
+            driver = self.cycle.find_looping_driver()
             if driver is not None:
                 driver.loop(self._turn)
 
@@ -307,7 +307,7 @@ class HostProcess:
         if self.closing:
             self._resting = cycle.stop_sessions()
             if self._is_over():
-                driver = cycle.looping_driver()
+                driver = cycle.find_looping_driver()
                 if driver is not None:
                     driver.halt()
                 return
@@ -319,8 +319,8 @@ class HostProcess:
     def _run_cycle(self) -> None:
         self._alarm()
         now = self.pace.wait()
-        late = self._suspension is not None and self._suspension.ended()
-        self.cycle.step(now, self.pace.heard(self.memory.get_app()), late)
+        late = self._suspension is not None and self._suspension.was_suspended()
+        self.cycle.step(now, self.pace.adjust_heartbeat(self.memory.get_app()), late)
         self._publish(now)
 
     def _run_granted_cycle(self) -> None:
@@ -355,7 +355,7 @@ class HostProcess:
         else:
             if message is not None:
                 self._serve(message)
-            if self._app_gone():
+            if self._is_app_gone():
                 self.closing = True
         if self.closing:
             self.pace.run_free()
@@ -400,7 +400,7 @@ class HostProcess:
             pace.reset_statistics()
         return result
 
-    def _app_gone(self) -> bool:
+    def _is_app_gone(self) -> bool:
         if os.getppid() != self.parent:
             return True
         heartbeat = self.memory.get_app().t

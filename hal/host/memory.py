@@ -21,7 +21,7 @@ __all__ = [
     "Mailbox",
     "Newest",
     "SeriesBox",
-    "newest",
+    "make_reader",
 ]
 
 _HEADER = 8  # bytes: the announced number, in the machine's own order: this memory is never sent
@@ -205,7 +205,7 @@ class Newest(Generic[Raw, Record]):
         return known[1]
 
 
-def newest(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record]) -> Callable[[], Record | None]:
+def make_reader(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record]) -> Callable[[], Record | None]:
     """Return a function that returns the newest record of ``box``, decoded."""
     return Newest(box.seq, box.read, decode).get
 
@@ -230,27 +230,27 @@ class History(Generic[State]):
         self._box = box
         self._decode = decode
 
-    def since(self, t: float) -> list[State]:
+    def read_since(self, t: float) -> list[State]:
         """Return every state newer than ``t`` (s), oldest first, as far back as they are kept."""
         newest = self._box.seq()
-        first = self._first_after(t, newest)
+        first = self._find_first(t, newest)
         found = (self._box.bytes_at(number) for number in range(first, newest + 1))
         return [self._decode(record) for record in found if record is not None]
 
-    def around(self, t: float) -> tuple[State, State] | None:
+    def find_around(self, t: float) -> tuple[State, State] | None:
         """Return the last state at or before ``t`` (s) and the first after it, or the newest twice.
 
         None if ``t`` is older than what is kept, and before the first state.
         """
         newest = self._box.seq()
-        after = self._first_after(t, newest)
+        after = self._find_first(t, newest)
         before = self._box.bytes_at(after - 1)
         if before is None or _T.unpack_from(before)[0] > t:
             return None
         later = self._box.bytes_at(after) if after <= newest else before
         return None if later is None else (self._decode(before), self._decode(later))
 
-    def _first_after(self, t: float, newest: int) -> int:
+    def _find_first(self, t: float, newest: int) -> int:
         """Return the number of the first state newer than ``t`` (s); ``newest + 1`` if there is none."""
         low, high = min(self._box.oldest, newest + 1), newest + 1
         while low < high:

@@ -8,7 +8,7 @@ from typing import Any
 from ..specs import GroupSpec
 from .records import GripperMail, GroupMemory, RobotMail
 
-__all__ = ["RobotMirror", "mirrors_of"]
+__all__ = ["RobotMirror", "make_mirrors"]
 
 
 class RobotMirror:
@@ -28,7 +28,7 @@ class RobotMirror:
         world.follow(self.name, state.q, state.dq, gripper.state.width if gripper is not None else None)
 
 
-def mirrors_of(group: GroupSpec, memories: Iterable[GroupMemory]) -> tuple[RobotMirror, ...]:
+def make_mirrors(group: GroupSpec, memories: Iterable[GroupMemory]) -> tuple[RobotMirror, ...]:
     """Return the mirrors of the arms that stand in this group's world and belong to the groups behind ``memories``."""
     if group.world is None:
         return ()

@@ -22,7 +22,7 @@ from ..driver import Reading
 from ..errors import Fault
 from ..geometry import Pose
 from ..types import ControlMode, GripperOutcome, GripperState, Limited, RobotState, RobotStatus, Stamp, Trip
-from .memory import History, Mailbox, Newest, SeriesBox, newest
+from .memory import History, Mailbox, Newest, SeriesBox, make_reader
 
 if TYPE_CHECKING:
     from ..driver import GripperReading
@@ -41,8 +41,8 @@ __all__ = [
     "RobotMail",
     "ServoRecord",
     "StateLayout",
-    "fault_at",
-    "fault_of",
+    "read_fault",
+    "make_fault",
     "fault_values",
 ]
 
@@ -61,14 +61,14 @@ def fault_values(fault: Fault | None) -> tuple[Any, ...]:
     return (True, *(text.encode()[:size] for text, size in zip(texts, _TEXTS, strict=True)))
 
 
-def fault_of(there: bool, *texts: bytes) -> Fault | None:
+def make_fault(there: bool, *texts: bytes) -> Fault | None:
     """Return the fault of such values; None if there is none."""
     return Fault(*(text.rstrip(b"\0").decode(errors="ignore") for text in texts)) if there else None
 
 
-def fault_at(record: bytes, offset: int) -> Fault | None:
+def read_fault(record: bytes, offset: int) -> Fault | None:
     """Return the fault in a record; most have none, which one byte shows."""
-    return fault_of(*_FAULT.unpack_from(record, offset)) if record[offset] else None
+    return make_fault(*_FAULT.unpack_from(record, offset)) if record[offset] else None
 
 
 _STAMP = struct.Struct("<ddQ")
@@ -179,8 +179,8 @@ class StateLayout:
         status, trip, limited, *rest = values[:9]
         controller, held_back, progress, off_path, overrun, *end = values[9:]
         sets = self._set_points.unpack_from(record, self._set_at)
-        n, first = self.n, (_STATUSES[status], _TRIPS[trip], _limited(limited))
-        motion = (_limited(held_back), progress, off_path, _limited(overrun), *end)
+        n, first = self.n, (_STATUSES[status], _TRIPS[trip], _decode_limits(limited))
+        motion = (_decode_limits(held_back), progress, off_path, _decode_limits(overrun), *end)
         return ServoRecord._make((*first, *rest, sets[:n], sets[n:], _CONTROLLERS[controller], (), *motion))
 
     def state(self, record: bytes) -> RobotState:
@@ -196,29 +196,29 @@ class StateLayout:
             stamp=Stamp(*_STAMP.unpack_from(record, 0)),
             q=numbers[:n],
             dq=numbers[n : 2 * n],
-            tau=_known(tau),
+            tau=_drop_unknown(tau),
             q_set=numbers[3 * n : 4 * n],
             dq_set=numbers[4 * n : 5 * n],
             tcp=Pose.trusted(tail[:3], tail[3:7]),
             tcp_set=Pose.trusted(tail[7:10], tail[10:14]),
             tcp_twist=tail[14:20],
-            tau_ext=_known(tau_ext),
-            wrench_ext=_known(wrench_ext),
+            tau_ext=_drop_unknown(tau_ext),
+            wrench_ext=_drop_unknown(wrench_ext),
             status=_STATUSES[status],
             trip=_TRIPS[trip],
-            fault=fault_at(record, end + _SERVO.size),
-            limited=_limited(limited),
+            fault=read_fault(record, end + _SERVO.size),
+            limited=_decode_limits(limited),
             target_seq=target_seq,
             controller=controller,
-            tau_set=_known(tau_set),
+            tau_set=_drop_unknown(tau_set),
         )
 
 
-def _limited(bits: int) -> Limited:
+def _decode_limits(bits: int) -> Limited:
     return Limited(bits) if bits else Limited.NONE
 
 
-def _known(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _drop_unknown(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return None if isnan(values[0]) else values
 
 
@@ -274,9 +274,9 @@ class GripperMail:
         self.state = Mailbox(buffer[Mailbox.size(_GRIPPER_COMMAND) :], _GRIPPER_STATE + FAULT_FORMAT, GRIPPER_STATES)
         self.history = History(self.state, _gripper_state)
         """The last :data:`GRIPPER_STATES` states."""
-        self.get_command = newest(self.command, _command)
+        self.get_command = make_reader(self.command, _command)
         """Returns the newest command; None before the first one."""
-        self.get = newest(self.state, _record)
+        self.get = make_reader(self.state, _record)
         """Returns the newest record; None before the first one."""
 
     @classmethod
@@ -329,7 +329,7 @@ def _record(values: tuple[Any, ...]) -> GripperRecord:
         grasped=None if grasped == _UNKNOWN else grasped == _YES,
         force=None if math.isnan(force) else force,
         outcome=GripperOutcome(outcome),
-        fault=fault_of(*fault),
+        fault=make_fault(*fault),
         target_seq=target_seq,
     )
     return GripperRecord(state, lost)
@@ -379,9 +379,9 @@ class RobotMail:
         self.command, self.deadman, self.session, self.state = boxes
         self._chunk = SeriesBox(buffer[offset:], _chunk_capacity(n))
         state = self.state
-        self.get_command = newest(self.command, self._command)
+        self.get_command = make_reader(self.command, self._command)
         """Returns the newest command; None before the first one."""
-        self.get_deadman = newest(self.deadman, DeadmanRecord._make)
+        self.get_deadman = make_reader(self.deadman, DeadmanRecord._make)
         """Returns the newest record of the dead-man; None before the first one."""
         self.get_state = Newest(state.seq, state.read_bytes, self._layout.state).get
         """Returns the newest state; None before the first one."""
@@ -389,7 +389,7 @@ class RobotMail:
         """Returns only the servo's part of the newest state: for every ``send``."""
         self.history = History(state, self._layout.state)
         """The last :data:`STATES` states."""
-        self._newest_session = newest(self.session, SessionRecord._make)
+        self._newest_session = make_reader(self.session, SessionRecord._make)
 
     @staticmethod
     def layouts(n: int) -> tuple[tuple[str, int], ...]:
@@ -470,8 +470,8 @@ class GroupMemory:
         offset = Mailbox.size(_APP)
         self.host = Mailbox(buffer[offset:], _HOST)
         offset += Mailbox.size(_HOST)
-        self._newest_app = newest(self.app, AppRecord._make)
-        self._newest_host = newest(self.host, HostRecord._make)
+        self._newest_app = make_reader(self.app, AppRecord._make)
+        self._newest_host = make_reader(self.host, HostRecord._make)
         self.robots: dict[str, RobotMail] = {}
         for name, n in robots:
             self.robots[name] = RobotMail(buffer[offset:], n)

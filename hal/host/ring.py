@@ -45,7 +45,7 @@ _TRIES = 3
 _UNKNOWN_POSE = (math.nan,) * 7
 
 
-def _aligned(size: int) -> int:
+def _align(size: int) -> int:
     return -(-size // _ALIGNMENT) * _ALIGNMENT
 
 
@@ -67,18 +67,18 @@ class ArrayRing(Generic[Key]):
         place = _ALIGNMENT
         for _ in range(slots):
             self._starts.append(place)
-            place += _aligned(_HEADER.size)
+            place += _align(_HEADER.size)
             views = {}
             for key, (shape, dtype) in arrays.items():
                 views[key] = np.frombuffer(buffer, dtype, math.prod(shape), place).reshape(shape)
-                place += _aligned(views[key].nbytes)
+                place += _align(views[key].nbytes)
             self.slots.append(views)
 
     @staticmethod
-    def bytes_of(arrays: Mapping[Key, tuple[tuple[int, ...], DTypeLike]], slots: int) -> int:
+    def count_bytes(arrays: Mapping[Key, tuple[tuple[int, ...], DTypeLike]], slots: int) -> int:
         """Return the number of bytes that such a ring needs."""
-        payload = sum(_aligned(math.prod(shape) * np.dtype(dtype).itemsize) for shape, dtype in arrays.values())
-        return _ALIGNMENT + slots * (_aligned(_HEADER.size) + payload)
+        payload = sum(_align(math.prod(shape) * np.dtype(dtype).itemsize) for shape, dtype in arrays.values())
+        return _ALIGNMENT + slots * (_align(_HEADER.size) + payload)
 
     def _get(self, place: int) -> int:
         return int(_NUMBER.unpack_from(self._buffer, place)[0])
@@ -150,14 +150,14 @@ class FrameRing(ArrayRing[str]):
     """The frames of one camera. One process writes, one reads."""
 
     def __init__(self, buffer: memoryview, spec: CameraSpec) -> None:
-        super().__init__(buffer, _arrays_of(spec), _SLOTS)
+        super().__init__(buffer, _list_arrays(spec), _SLOTS)
         self._period = 1.0 / spec.rate_hz
         self._arrived = 0.0
 
     @staticmethod
     def size(spec: CameraSpec) -> int:
         """Return the number of bytes that the ring of this camera needs."""
-        return ArrayRing.bytes_of(_arrays_of(spec), _SLOTS)
+        return ArrayRing.count_bytes(_list_arrays(spec), _SLOTS)
 
     def write(self, frame: RawFrame) -> int:
         """Copy a frame into the ring and return its number, which also replaces ``frame.seq``."""
@@ -239,7 +239,7 @@ def frame_rings_size(specs: Sequence[CameraSpec]) -> int:
     return sum(FrameRing.size(spec) for spec in specs)
 
 
-def _arrays_of(spec: CameraSpec) -> dict[str, tuple[tuple[int, ...], DTypeLike]]:
+def _list_arrays(spec: CameraSpec) -> dict[str, tuple[tuple[int, ...], DTypeLike]]:
     """Return shape and type of the pictures of each stream of a camera."""
     return {
         name: ((spec.height, spec.width, *more), dtype)

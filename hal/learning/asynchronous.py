@@ -112,7 +112,7 @@ class RemotePolicy:
         """
         self.rig, self.client = rig, client
         self.robot = next(iter(rig.robots.values())) if robot is None else robot
-        self.config = config or self._described(client.connect())
+        self.config = config or self._read_metadata(client.connect())
         self.task = task
         self._latency = number("latency", latency, "s", least=0.0)
         if latency and not rig.lock_step:
@@ -152,7 +152,7 @@ class RemotePolicy:
         self._ask(observation, self.rig.clock.now(), longest)
         assert self._pending is not None
         reply, self._pending = self._pending.reply, None
-        actions = check_actions(self._result(reply, longest), self._numbers)
+        actions = check_actions(self._wait_result(reply, longest), self._numbers)
         self._decode(actions[:CHUNK_POINTS], observation)
         return None
 
@@ -165,7 +165,7 @@ class RemotePolicy:
         self.restart()
         if self._pending is not None:  # replies bear no number: the last one must be off the line
             with contextlib.suppress(PolicyError):
-                self._result(self._pending.reply)
+                self._wait_result(self._pending.reply)
         self._pending, self._overtaken = None, False
         self._latency_counts = Histogram(1e-3, 10_000)
         self._chunks = self._late = self._steep = 0
@@ -173,7 +173,7 @@ class RemotePolicy:
         self._connect()
         self._session_id = str(uuid.UUID(int=0 if seed is None else seed))
         if self._resets:
-            self._result(self.client.request({"endpoint": "reset", "session_id": self._session_id}))
+            self._wait_result(self.client.request({"endpoint": "reset", "session_id": self._session_id}))
 
     def restart(self) -> None:
         """Forget the present chunk, after a pause; an answer under way is not used, and the policy is asked again."""
@@ -195,7 +195,7 @@ class RemotePolicy:
                 chunks = self._receive(now)
         self._check_end(now)
         self._called = now
-        return {name: (chunks.get(name), self._due_grip(name, now)) for name in self.robots}
+        return {name: (chunks.get(name), self._find_due_grip(name, now)) for name in self.robots}
 
     def statistics(self) -> dict[str, Any]:
         """Return figures of this episode.
@@ -249,9 +249,9 @@ class RemotePolicy:
                 code="policy_mismatch",
             )
         if size is not None:
-            self.config = self.config.with_size(*size)
+            self.config = self.config.resize_pictures(*size)
 
-    def _described(self, metadata: dict[str, Any]) -> PolicyConfig:
+    def _read_metadata(self, metadata: dict[str, Any]) -> PolicyConfig:
         """Return the configuration that a server describes in its metadata."""
         if "policy_config" not in metadata:
             raise PolicyError(
@@ -302,14 +302,14 @@ class RemotePolicy:
             return None
         count = int((chunk.t[-1] - first) / self._dt + 1e-6) + 1
         t: Array = first + self._dt * np.arange(count, dtype=float)
-        targets = {name: _sampled(chunk.t, decoded, t) for name, decoded in chunk.targets.items()}
+        targets = {name: _sample(chunk.t, decoded, t) for name, decoded in chunk.targets.items()}
         delay = max(0, int((now + self._lead() + _ONSET - first) / self._dt + 1.0))
         return {
             "delay_steps": min(delay, self._rtc_delay, len(t)),
             "actions": self.config.encode(targets, observation, self._used).astype(np.float32),
         }
 
-    def _result(self, reply: Future[Any], timeout: float | None = None) -> Any:
+    def _wait_result(self, reply: Future[Any], timeout: float | None = None) -> Any:
         try:
             return reply.result((timeout or self.client.timeout) + 1.0)
         except FutureTimeoutError:
@@ -327,7 +327,7 @@ class RemotePolicy:
         if pending is None or now < pending.t + self._latency or not (self.rig.lock_step or pending.reply.done()):
             return {}
         self._pending = None
-        reply = self._result(pending.reply)
+        reply = self._wait_result(pending.reply)
         if self._overtaken:
             self._overtaken = False
             return {}
@@ -340,13 +340,13 @@ class RemotePolicy:
 
     def _follow(self, actions: Array, pending: _Pending, now: float) -> dict[str, JointChunk]:
         if len(actions) == 1:
-            chunk = self._single(self._decode(actions, pending.observation), pending, now)
+            chunk = self._make_single(self._decode(actions, pending.observation), pending, now)
         else:
-            chunk = self._several(actions, pending.observation, now)
+            chunk = self._make_chunk(actions, pending.observation, now)
         self._chunk = chunk
         return {name: JointChunk(chunk.t, arm.q) for name, arm in chunk.targets.items()}
 
-    def _single(self, decoded: dict[str, Decoded], pending: _Pending, now: float) -> _Chunk:
+    def _make_single(self, decoded: dict[str, Decoded], pending: _Pending, now: float) -> _Chunk:
         """Return the chunk of one action: the arm goes there, and stays."""
         t: Array = now + np.array([_SINGLE_STEPS * self._dt, _HOLD])
         chunk = _Chunk(t, {name: arm.rows([0, 0]) for name, arm in decoded.items()}, float(t[0]), pending.t + self._dt)
@@ -356,7 +356,7 @@ class RemotePolicy:
         planned = self._chunk.t_ask + self._dt  # turns are rounded up to those of the runner, without adding up
         return chunk._replace(t_ask=planned) if planned > pending.t else chunk
 
-    def _several(self, actions: Array, observation: Observation, now: float) -> _Chunk:
+    def _make_chunk(self, actions: Array, observation: Observation, now: float) -> _Chunk:
         execute, first, old = self.config.execute or max(1, len(actions) // 2), self.config.due, self._chunk
         # An arm that has stood still since the observation starts at the beginning, not where it would have been.
         start = now if old is None else observation.t
@@ -377,9 +377,9 @@ class RemotePolicy:
         if old is None:
             return chunk
         self._check_splice(old, chunk, now)
-        return self._blended(old, t, decoded, chunk, now)
+        return self._blend(old, t, decoded, chunk, now)
 
-    def _blended(self, old: _Chunk, t: Array, decoded: dict[str, Decoded], new: _Chunk, now: float) -> _Chunk:
+    def _blend(self, old: _Chunk, t: Array, decoded: dict[str, Decoded], new: _Chunk, now: float) -> _Chunk:
         """Return ``new`` at the times of the old chunk, which changes into it over the steps of ``blend``.
 
         Both have a target every step, but not at the same times: one that is due shortly after another of the other
@@ -399,8 +399,8 @@ class RemotePolicy:
         share[grid > old.t[-1]] = 1.0
         targets = {}
         for name, arm in decoded.items():
-            fresh = _sampled(t, arm, grid)
-            q = fresh.q + (1.0 - share)[:, None] * (_sampled(old.t, old.targets[name], grid).q - fresh.q)
+            fresh = _sample(t, arm, grid)
+            q = fresh.q + (1.0 - share)[:, None] * (_sample(old.t, old.targets[name], grid).q - fresh.q)
             k = np.maximum(np.searchsorted(t, grid + _ONSET) - 1, 0)
             targets[name] = Decoded(q, None if arm.grip is None else arm.grip[k])
         return new._replace(t=grid, targets=targets)
@@ -417,7 +417,7 @@ class RemotePolicy:
         self._late += now > old.t_next
         steep = False
         for name, robot in self.robots.items():
-            planned = _sampled(old.t, old.targets[name], new.t[:1]).q[0]
+            planned = _sample(old.t, old.targets[name], new.t[:1]).q[0]
             step, fastest = np.abs(new.targets[name].q[0] - planned), np.asarray(robot.limits.velocity)
             self._splice = max(self._splice, float(step.max()))
             steep = steep or bool((step > fastest * self._dt).any())
@@ -441,11 +441,11 @@ class RemotePolicy:
         if now + 1.5 * turn < chunk.t[-1]:
             return
         if pending is not None and pending.reply.done() and not self._latency:
-            self._result(pending.reply)  # raises the reason if there is one; otherwise it is used in the next turn
+            self._wait_result(pending.reply)  # raises the reason if there is one; otherwise it is used in the next turn
             return
         raise PolicyError("the policy did not answer before its last chunk ended", code="policy_too_late")
 
-    def _due_grip(self, name: str, now: float) -> float | None:
+    def _find_due_grip(self, name: str, now: float) -> float | None:
         """Return the grip of an arm that is due, if it differs from the last one."""
         chunk = self._chunk
         if chunk is None or (grips := chunk.targets[name].grip) is None:
@@ -464,7 +464,7 @@ def _is_size(size: Any) -> bool:
     return sound and all(type(pixels) is int and 8 <= pixels <= 4096 for pixels in size)
 
 
-def _sampled(t: Array, targets: Decoded, at: Array) -> Decoded:
+def _sample(t: Array, targets: Decoded, at: Array) -> Decoded:
     """Return the targets at other times; before the first and after the last, these."""
     q = np.stack([np.interp(at, t, column) for column in targets.q.T], axis=1)
     return Decoded(q, None if targets.grip is None else np.interp(at, t, targets.grip))

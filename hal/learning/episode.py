@@ -86,9 +86,9 @@ class _RandomBody(NamedTuple):
         """Return a random pose, and the box around the object there."""
         numbers = random.uniform(self.ranges.lower, self.ranges.upper)
         pose = Pose.from_rpy(numbers[:3], numbers[3:].tolist()) @ Pose(orientation=self.orientation)
-        return pose, None if self.corners is None else _box_around(pose.transform(self.corners))
+        return pose, None if self.corners is None else _enclose(pose.transform(self.corners))
 
-    def overlaps(self, box: _Box | None, solids: _Solids) -> set[str]:
+    def find_overlaps(self, box: _Box | None, solids: _Solids) -> set[str]:
         """Return the names of the solids that it would overlap there."""
         if box is None:
             return set()
@@ -133,9 +133,9 @@ def sample_poses(rig: Rig, random: np.random.Generator, given: Collection[str] =
         return {}
     free = {body.name for body in plan.bodies if body.robot is not None or not (body.collision or body.urdf)}
     rest = sorted(there - free - {body.name for body, _ in drawn})
-    still = {name: solid for name in rest if (solid := _solid(rig.world, name)) is not None}
+    still = {name: solid for name in rest if (solid := _find_solid(rig.world, name)) is not None}
     home = {body.name: still[body.name] for body in plan.bodies if body.name in still and body.name not in given}
-    movers = [_random_body(rig.world, body, ranges, None if body.name in free else home) for body, ranges in drawn]
+    movers = [_make_random_body(rig.world, body, ranges, None if body.name in free else home) for body, ranges in drawn]
     for _ in range(_ROUNDS):
         try:
             return _arrange(movers, random, still)
@@ -156,7 +156,7 @@ def _arrange(movers: Sequence[_RandomBody], random: np.random.Generator, still: 
         overlapped: set[str] = set()
         for _ in range(_TRIES):
             pose, box = body.sample(random)
-            if not (new := body.overlaps(box, solids)):
+            if not (new := body.find_overlaps(box, solids)):
                 break
             overlapped |= new
         else:
@@ -167,7 +167,7 @@ def _arrange(movers: Sequence[_RandomBody], random: np.random.Generator, still: 
     return poses
 
 
-def _random_body(world: World, body: BodySpec, ranges: RangesSpec, home: _Solids | None) -> _RandomBody:
+def _make_random_body(world: World, body: BodySpec, ranges: RangesSpec, home: _Solids | None) -> _RandomBody:
     """Return an object with what its poses depend on.
 
     Args:
@@ -178,16 +178,16 @@ def _random_body(world: World, body: BodySpec, ranges: RangesSpec, home: _Solids
     """
     if home is None:
         return _RandomBody(body.name, body.orientation, ranges, None, {})
-    corners = _own_corners(world, body)
-    box = _box_around(Pose(body.position, body.orientation).transform(corners))
+    corners = _find_corners(world, body)
+    box = _enclose(Pose(body.position, body.orientation).transform(corners))
     touched = {name: depth for name, solid in home.items() if (depth := solid.overlap(box)) > 0.0}
     allowed = {name: np.inf if depth > _TOUCHING else depth for name, depth in touched.items()}
     return _RandomBody(body.name, body.orientation, ranges, corners, allowed)
 
 
-def _own_corners(world: World, body: BodySpec) -> Array:
+def _find_corners(world: World, body: BodySpec) -> Array:
     """Return the corners (8, 3) of a box around an object, in its own frame, m."""
-    half = _half(body)
+    half = _find_half_size(body)
     if half is not None:
         return _Box(-half, half).corners()
     for _ in range(_READS):  # it may be falling, and both must be of the same time
@@ -198,7 +198,7 @@ def _own_corners(world: World, body: BodySpec) -> Array:
     return pose.inverse().transform(box.corners())
 
 
-def _half(body: BodySpec) -> Array | None:
+def _find_half_size(body: BodySpec) -> Array | None:
     """Return half the size (3,) of a simple shape, m; None for other shapes."""
     radius, length = body.radius or 0.0, body.length or 0.0
     sizes = {
@@ -211,7 +211,7 @@ def _half(body: BodySpec) -> Array | None:
     return None if half is None else np.array(half)
 
 
-def _solid(world: World, name: str) -> _Box | _Plane | None:
+def _find_solid(world: World, name: str) -> _Box | _Plane | None:
     """Return the space that a body takes now; None if nothing collides with it."""
     lower, upper = world.aabb(name)
     if not (lower < upper).any():
@@ -222,7 +222,7 @@ def _solid(world: World, name: str) -> _Box | _Plane | None:
     return _Plane(pose.position, pose.transform([0.0, 0.0, 1.0]) - pose.position)
 
 
-def _box_around(points: Array) -> _Box:
+def _enclose(points: Array) -> _Box:
     return _Box(points.min(axis=0), points.max(axis=0))
 
 
@@ -292,14 +292,12 @@ def reset_scene(
     put = dict(poses or {})
     for name, pose in put.items():
         rig.world.reset(name, pose=pose)
-    if random is not None:
-        drawn = sample_poses(rig, random, given=put)
-        for name, pose in drawn.items():
-            rig.world.reset(name, pose=pose)
-        put |= drawn
+    drawn = {} if random is None else sample_poses(rig, random, given=put)
+    for name, pose in drawn.items():
+        rig.world.reset(name, pose=pose)
     if inside:
         rig.world.reset(robot.name, q=robot.spec.initial if q is None else np.asarray(q, float))
-    return put
+    return put | drawn
 
 
 def _wait_for_press(clock: Clock, deadman: Deadman, since: int, patience: float) -> None:

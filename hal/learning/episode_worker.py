@@ -150,7 +150,7 @@ class EpisodeWorker:
                     self._functions["reset"](rig, generator)
             except Exception as error:
                 return vars(EpisodeResult(number, seed, None, "error", _trace(error)))
-            recorder = self._recorder_of(rig)
+            recorder = self._get_recorder(rig)
             recorder.start(seed=seed, info={"episode": number, "recipe": vars(r)})
             try:
                 success, ended, reason = self._perform(rig, robot, generator, seed)
@@ -181,7 +181,7 @@ class EpisodeWorker:
             self._recorder.close()
             self._recorder = None
 
-    def _recorder_of(self, rig: Rig) -> Recorder:
+    def _get_recorder(self, rig: Rig) -> Recorder:
         """Return the recorder, for this rig; its process is started once."""
         r = self.recipe
         if self._recorder is None:
@@ -315,7 +315,7 @@ def _difference(made: Any, recipe: dict[str, Any]) -> str:
     """Describe how the recipe of an episode on the disk differs."""
     if not isinstance(made, dict):
         return "has episodes that were not generated"
-    old, new = _flat_options(made), _flat_options(recipe)
+    old, new = _flatten_options(made), _flatten_options(recipe)
     other = [key for key in {**old, **new} if old.get(key) != new.get(key)]
     if other == ["plan"]:
         return "was generated with a rig that has changed since, or with another version of it"
@@ -324,7 +324,7 @@ def _difference(made: Any, recipe: dict[str, Any]) -> str:
     )
 
 
-def _flat_options(recipe: dict[str, Any]) -> dict[str, Any]:
+def _flatten_options(recipe: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a recipe, with the options of its rig among them."""
     return {**{key: value for key, value in recipe.items() if key != "rig"}, **recipe.get("rig", {})}
 

@@ -86,7 +86,7 @@ def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, spee
             low += robot.limits.lower
             high += robot.limits.upper
         elif kind in ("velocity", "torque"):
-            most = _greatest(robot, kind)
+            most = _find_limits(robot, kind)
             low += [-value for value in most]
             high += most
         elif kind in ("tcp_delta", "twist"):
@@ -103,7 +103,7 @@ def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, spee
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
-def _greatest(robot: Robot, kind: ActionKind) -> list[float]:
+def _find_limits(robot: Robot, kind: ActionKind) -> list[float]:
     """Return the greatest joint velocities of a session (n,), rad/s, or the greatest torques (n,), Nm."""
     if kind == "velocity":
         return [robot.spec.speed * value for value in robot.limits.velocity]
@@ -142,17 +142,17 @@ def observation_space(
         CommandError: Two entries would have the same key (code ``duplicate_name``).
     """
 
-    def free(size: int) -> spaces.Box:
+    def make_box(size: int) -> spaces.Box:
         return spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
     parts: list[tuple[str, spaces.Space[Any]]] = []
     for lead, robot in robots.items():
         sizes = {"q": robot.n, "dq": robot.n, "tcp": 7} | ({"gripper": 1} if robot.gripper is not None else {})
-        parts += [(lead + name, free(size)) for name, size in sizes.items()]
+        parts += [(lead + name, make_box(size)) for name, size in sizes.items()]
     for camera in cameras:
-        found = [stream for stream in streams if stream in _offered(camera.spec)]
+        found = [stream for stream in streams if stream in _list_streams(camera.spec)]
         parts += [(entry_key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
-    parts += [(entry_key("object", name), free(7)) for name in objects]
+    parts += [(entry_key("object", name), make_box(7)) for name in objects]
     keys = [name for name, _ in parts]
     if twice := sorted({name for name in keys if keys.count(name) > 1}):
         raise CommandError(
@@ -201,7 +201,7 @@ def numbers_and_pictures(
     return shown
 
 
-def _offered(camera: CameraSpec) -> tuple[str, ...]:
+def _list_streams(camera: CameraSpec) -> tuple[str, ...]:
     """Return the streams of a camera that can be observed: its own, and points where it has depth."""
     return (*camera.streams, POINTS) if "depth" in camera.streams else tuple(camera.streams)
 
@@ -266,6 +266,20 @@ class _EnvArm:
         return CartesianTarget(self.goal), grip
 
 
+def _check_lists(**arguments: Collection[str] | None) -> None:
+    """Raise CommandError for one name in the place of a list of them."""
+    for argument, names in arguments.items():
+        if isinstance(names, str):
+            raise CommandError(f"{argument} must be a list of names: [{names!r}]", code="not_a_list")
+
+
+def _check_functions(**arguments: object) -> None:
+    """Raise CommandError for anything that is neither None nor a function."""
+    for argument, function in arguments.items():
+        if function is not None and not callable(function):
+            raise CommandError(f"{argument} must be a function, not {function!r}", code="not_callable")
+
+
 class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """An arm of a rig, or several, with their grippers and cameras, as a Gymnasium environment.
 
@@ -283,6 +297,40 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     ``step`` sends the action, lets one period pass and waits for an observation that was taken after that, so that no
     observation is returned twice. If the arm is stopped (releasing the dead-man is not a stop), the episode is
     truncated and ``info["stopped"]`` has the reason.
+
+    Args:
+        config: The rig's configuration, as for :func:`hal.open`.
+        sim: True for simulated drivers, as for :func:`hal.open`.
+        driver: Driver of all devices, as for :func:`hal.open`.
+        engine: Engine of the simulated world, as for :func:`hal.open`.
+        robot: Name of the arm; None for the rig's first.
+        robots: Names of several arms, instead of ``robot``.
+        action: Kind of action, see :data:`ActionKind`.
+        controller: What makes the arm follow: :class:`hal.Position` by default, :class:`hal.JointImpedance` or
+            :class:`hal.OperationalSpace`. Not for torques.
+        cameras: Names of the observed cameras; None for all.
+        streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``,
+            ``segmentation`` and ``points``; None for colour and depth.
+        objects: Names of the objects of the simulated world whose poses are observed.
+        rate_hz: Steps per second.
+        max_steps: Steps after which an episode is truncated; None for no limit.
+        speeds: Greatest speeds of the tcp for ``twist`` and, per step, for ``tcp_delta``: m/s and rad/s.
+        reward: Called as ``reward(env, observation)`` after each step; None for a reward of 0.
+        terminated: Called as ``terminated(env, observation)`` after each step.
+        on_reset: Called as ``on_reset(env, options)`` after the reset and before the first observation: time for
+            the operator to arrange a real bench, or for a task to move objects with ``env.rig.world`` and
+            ``env.np_random``.
+        deadman: Makes the dead-man from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``;
+            something that really moves needs it, or ``unattended=True``.
+        unattended: Let a real arm move without a dead-man.
+        overrides: Changes of the configuration, ``key=value``.
+        render_mode: None or ``rgb_array``.
+
+    Raises:
+        CommandError: An argument is wrong, also one of the control session (see :meth:`hal.robot.Robot.control`).
+        NotSupported: The rig lacks a stream (code ``unknown_stream``) or a world (``no_world``); the arm takes no
+            controller.
+        DriverMissing: gymnasium is not installed.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # Gymnasium's own name and type
@@ -312,63 +360,19 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         overrides: tuple[str, ...] = (),
         render_mode: str | None = None,
     ) -> None:
-        """Open the rig.
-
-        Args:
-            config: The rig's configuration, as for :func:`hal.open`.
-            sim: True for simulated drivers, as for :func:`hal.open`.
-            driver: Driver of all devices, as for :func:`hal.open`.
-            engine: Engine of the simulated world, as for :func:`hal.open`.
-            robot: Name of the arm; None for the rig's first.
-            robots: Names of several arms, instead of ``robot``.
-            action: Kind of action, see :data:`ActionKind`.
-            controller: What makes the arm follow: :class:`hal.Position` by default, :class:`hal.JointImpedance` or
-                :class:`hal.OperationalSpace`. Not for torques.
-            cameras: Names of the observed cameras; None for all.
-            streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``,
-                ``segmentation`` and ``points``; None for colour and depth.
-            objects: Names of the objects of the simulated world whose poses are observed.
-            rate_hz: Steps per second.
-            max_steps: Steps after which an episode is truncated; None for no limit.
-            speeds: Greatest speeds of the tcp for ``twist`` and, per step, for ``tcp_delta``: m/s and rad/s.
-            reward: Called as ``reward(env, observation)`` after each step; None for a reward of 0.
-            terminated: Called as ``terminated(env, observation)`` after each step.
-            on_reset: Called as ``on_reset(env, options)`` after the reset and before the first observation: time for
-                the operator to arrange a real bench, or for a task to move objects with ``env.rig.world`` and
-                ``env.np_random``.
-            deadman: Makes the dead-man from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``;
-                something that really moves needs it, or ``unattended=True``.
-            unattended: Let a real arm move without a dead-man.
-            overrides: Changes of the configuration, ``key=value``.
-            render_mode: None or ``rgb_array``.
-
-        Raises:
-            CommandError: An argument is wrong, also one of the control session (see :meth:`hal.robot.Robot.control`).
-            NotSupported: The rig lacks a stream (code ``unknown_stream``) or a world (``no_world``); the arm takes no
-                controller.
-            DriverMissing: gymnasium is not installed.
-        """
-        from ..servo.controllers import Position
-
         if render_mode not in (None, "rgb_array"):
-            raise NotSupported(
-                f"render_mode {render_mode!r}: use rgb_array, the first camera's picture", code="render_mode"
-            )
-        self.render_mode = render_mode
-        for argument, names in (("cameras", cameras), ("streams", streams), ("objects", objects)):
-            if isinstance(names, str):
-                raise CommandError(f"{argument} must be a list of names: [{names!r}]", code="not_a_list")
-        functions = {"reward": reward, "terminated": terminated, "on_reset": on_reset, "deadman": deadman}
-        for argument, function in functions.items():
-            if function is not None and not callable(function):
-                raise CommandError(f"{argument} must be a function, not {function!r}", code="not_callable")
+            text = f"render_mode {render_mode!r}: use rgb_array, the first camera's picture"
+            raise NotSupported(text, code="render_mode")
+        _check_lists(cameras=cameras, streams=streams, objects=objects)
+        _check_functions(reward=reward, terminated=terminated, on_reset=on_reset, deadman=deadman)
         rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
+        self.render_mode = render_mode
         self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
         self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
         self._unattended, self._controller = unattended, controller
         self.rig = self._open(config, deadman is not None, sim=sim, driver=driver, engine=engine, overrides=overrides)
         try:
-            chosen_robots = _chosen(self.rig, robot, robots)
+            chosen_robots = _choose_robots(self.rig, robot, robots)
             self.robot: Robot = chosen_robots[0]
             """The arm; the first of several."""
             self._arms = tuple(_EnvArm(arm, action) for arm in chosen_robots)
@@ -377,27 +381,31 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             """Name of each number of an action; with ``robots`` after the arm's name, as in recordings."""
             self._deadman = deadman(self.rig) if deadman is not None else None
             self._cameras = tuple(self.rig.cameras) if cameras is None else tuple(cameras)
-            self._objects = _known(objects, self.rig)
+            self._objects = _check_objects(objects, self.rig)
             chosen = [self.rig.cameras[name] for name in self._cameras]
-            self._streams = ("color", "depth") if streams is None else _streamed(streams, chosen)
+            self._streams = ("color", "depth") if streams is None else _check_streams(streams, chosen)
             self.action_space: Box = action_space(chosen_robots, action, rate_hz, speeds)  # type: ignore[assignment]
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
                 self._leads, chosen, self._streams, self._objects
             )
-            # Whether a pad can be trusted is checked at the reset: it may be asleep.
-            free = unattended or self._deadman is not None
-            for arm in chosen_robots:  # checks the arguments of its session, and opens none
-                checked = arm.control(rate_hz=rate_hz, unattended=free, controller=controller)
-                if action == "torque" and checked.controller != Position():
-                    raise CommandError("action='torque' takes no controller", code="torques_by_controller")
+            self._check_sessions()
         except BaseException:
             self.rig.close()
             raise
-        self._steps = 0
-        self._due = 0.0
-        self._start = 0.0
+        self._steps, self._due, self._start = 0, 0.0, 0.0
         self.observation: Observation | None = None
         """The complete record behind the newest observation."""
+
+    def _check_sessions(self) -> None:
+        """Check the arguments of the arms' control sessions, and open none. Raises CommandError."""
+        from ..servo.controllers import Position
+
+        # Whether a pad can be trusted is checked at the reset: it may be asleep.
+        free = self._unattended or self._deadman is not None
+        for arm in self._arms:
+            checked = arm.robot.control(rate_hz=self._rate, unattended=free, controller=self._controller)
+            if self._kind == "torque" and checked.controller != Position():
+                raise CommandError("action='torque' takes no controller", code="torques_by_controller")
 
     @staticmethod
     def _open(config: str | Path | Mapping[str, Any], pads: bool, **options: Any) -> Rig:
@@ -507,7 +515,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         now = clock.now()
         self._due = max(self._due + 1.0 / self._rate, now)  # a late turn is not caught up
         clock.sleep_until(self._due)
-        observation = self.rig.observe(after=self._fresh_from(now), cameras=self._cameras)
+        observation = self.rig.observe(after=self._find_oldest(now), cameras=self._cameras)
         self._steps += 1
         terminated = self._terminated is not None and bool(self._terminated(self, observation))
         truncated = bool(stopped) or (self._max_steps is not None and self._steps >= self._max_steps)
@@ -517,7 +525,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward = float(self._reward(self, observation)) if self._reward is not None else 0.0
         return self._observation_dict(observation), reward, terminated, truncated, info
 
-    def _fresh_from(self, sent: float) -> float | None:
+    def _find_oldest(self, sent: float) -> float | None:
         """Return the oldest time of an acceptable picture, s; None in lock-step, where all show the present.
 
         It is after the action, and as new as the rate of the slowest camera allows.
@@ -554,7 +562,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             self.rig.close()
 
 
-def _chosen(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[Robot]:
+def _choose_robots(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[Robot]:
     """Return the arms of an environment. Raises CommandError if both arguments are given, or a name twice."""
     if robots is None:
         return [rig.robots[robot] if robot else next(iter(rig.robots.values()))]
@@ -563,7 +571,7 @@ def _chosen(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[R
     return [rig.robots[name] for name in robots]
 
 
-def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
+def _check_objects(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
     """Return the names of objects whose poses can be observed. Raises NotSupported or DeviceNotFound."""
     if not objects:
         return ()
@@ -572,9 +580,9 @@ def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
     return tuple(rig.world.poses(objects).poses)
 
 
-def _streamed(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
+def _check_streams(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
     """Return the observed streams. Raises NotSupported for one that none of the cameras has."""
-    there = {stream for camera in cameras for stream in _offered(camera.spec)}
+    there = {stream for camera in cameras for stream in _list_streams(camera.spec)}
     if missing := [stream for stream in streams if stream not in there]:
         message = (
             f"streams=: no observed camera has {', '.join(missing)}; they have: {', '.join(sorted(there)) or 'none'}"

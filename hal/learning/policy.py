@@ -23,6 +23,7 @@ from .episode import stands_in_world
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from ..clock import Tick
     from ..control import Control
     from ..deadman import Deadman
     from ..rig import Rig
@@ -261,7 +262,7 @@ class PolicyRunner:
         that is not a command (code ``bad_answer``).
         """
         self._reset(None)
-        self._parts(getattr(self.policy, "rehearse", self.policy)(self._observe()))
+        self._split_answers(getattr(self.policy, "rehearse", self.policy)(self._observe()))
 
     def run(self, seed: int | None = None, on_turn: Callable[[float], None] = lambda seconds: None) -> PolicyOutcome:
         """Run one episode from the arms' present positions; they are at rest afterwards.
@@ -279,11 +280,11 @@ class PolicyRunner:
         controls = {name: robot.control(**self._terms) for name, robot in self.robots.items()}
         stopped: list[str] = []
         try:
-            with _policy_errors(PolicyError):
+            with _mark_errors(PolicyError):
                 self._reset(seed)
             if self._takeover is not None:
                 self._takeover.reset()
-            with _all_open(controls.values()):
+            with _open_all(controls.values()):
                 try:
                     self._drive(controls, tally, on_turn)
                 except (MotionStopped, RobotFault):
@@ -315,10 +316,7 @@ class PolicyRunner:
             mark = self._mark() if self._mark is not None else None
             if mark is not None:
                 return tally.end_as("success" if mark else "failure")
-            following = [name for name, control in controls.items() if control.hold_until_following()]
-            if len(following) < len(controls):
-                for name in following:
-                    _rest(controls[name])
+            if not _follow_together(controls.values()):
                 tally.count_pause()
                 begun, paused = set(), asked
                 continue
@@ -330,13 +328,7 @@ class PolicyRunner:
             seen = observation.t
             if self._success is not None and self._success(self.rig, observation):
                 return tally.end_as("success")
-            by_hand = self._takeover.command(tick.t, tick.dt) if self._takeover is not None else None
-            if by_hand is not None and self._takeover is not None:
-                for name, control in controls.items():
-                    if name == self._takeover.teleop.robot.name:
-                        control.send(by_hand[0], grip=by_hand[1])
-                    else:
-                        _rest(control)
+            if self._takeover is not None and self._drive_by_hand(self._takeover, controls, tick):
                 begun, paused = set(), asked
                 continue
             if paused:
@@ -345,11 +337,23 @@ class PolicyRunner:
             for name in controls.keys() - begun:
                 controls[name].hold_for(FIRST_ANSWER)
             answers = self._answer(observation, tally)
-            with _policy_errors((CommandError, PolicyError)):
+            with _mark_errors((CommandError, PolicyError)):
                 for name, (command, grip) in answers.items():
                     self._send(controls[name], command, grip, first=name not in begun)
             begun |= {name for name, (command, _) in answers.items() if command is not None}
         return None
+
+    def _drive_by_hand(self, takeover: Takeover, controls: Mapping[str, Control], tick: Tick) -> bool:
+        """Send a person's command to one arm, and let the others rest; return whether a person drives."""
+        by_hand = takeover.command(tick.t, tick.dt)
+        if by_hand is None:
+            return False
+        for name, control in controls.items():
+            if name == takeover.teleop.robot.name:
+                control.send(by_hand[0], grip=by_hand[1])
+            else:
+                _rest(control)
+        return True
 
     def _send(self, control: Control, command: Command | None, grip: float | None, first: bool) -> None:
         if command is None and grip is None:
@@ -363,12 +367,12 @@ class PolicyRunner:
 
     def _answer(self, observation: Observation, tally: _Tally) -> dict[str, tuple[Command | None, float | None]]:
         start = time.perf_counter()
-        with _policy_errors(Exception):
-            answers = self._parts(self.policy(observation))
+        with _mark_errors(Exception):
+            answers = self._split_answers(self.policy(observation))
         tally.inference.add(time.perf_counter() - start)
         return answers
 
-    def _parts(self, answer: Any) -> dict[str, tuple[Command | None, float | None]]:
+    def _split_answers(self, answer: Any) -> dict[str, tuple[Command | None, float | None]]:
         """Return command and grip for each arm. Raises CommandError for anything else (code ``bad_answer``)."""
         if not isinstance(answer, Mapping):
             if len(self.robots) > 1 and answer is not None:
@@ -383,11 +387,11 @@ class PolicyRunner:
                 f"the policy answers for {', '.join(sorted(map(str, unknown)))}; it moves {', '.join(self.robots)}",
                 code="bad_answer",
             )
-        return {name: _parts(part) for name, part in answer.items()}
+        return {name: _split_answer(part) for name, part in answer.items()}
 
 
 @contextlib.contextmanager
-def _all_open(controls: Collection[Control]) -> Iterator[None]:
+def _open_all(controls: Collection[Control]) -> Iterator[None]:
     """Open every arm's session; at the end all brake at once, and each is closed whatever happens to the others."""
     with contextlib.ExitStack() as closing:
         for control in controls:
@@ -397,6 +401,16 @@ def _all_open(controls: Collection[Control]) -> Iterator[None]:
         finally:
             for control in controls:
                 control.brake()
+
+
+def _follow_together(controls: Collection[Control]) -> bool:
+    """Return whether every arm follows its commands; if not, let those that do come to rest."""
+    following = [control for control in controls if control.hold_until_following()]
+    if len(following) == len(controls):
+        return True
+    for control in following:
+        _rest(control)
+    return False
 
 
 def _rest(control: Control) -> None:
@@ -409,7 +423,7 @@ class _PolicyError(Exception):
 
 
 @contextlib.contextmanager
-def _policy_errors(kind: type[Exception] | tuple[type[Exception], ...]) -> Iterator[None]:
+def _mark_errors(kind: type[Exception] | tuple[type[Exception], ...]) -> Iterator[None]:
     """Raise errors of this kind, or of these, as a :class:`_PolicyError`."""
     try:
         yield
@@ -462,7 +476,7 @@ class _Tally:
         )
 
 
-def _parts(answer: Any) -> tuple[Command | None, float | None]:
+def _split_answer(answer: Any) -> tuple[Command | None, float | None]:
     """Return command and grip of a policy's answer for one arm. Raises CommandError for anything else."""
     command, grip = answer, None
     if isinstance(answer, tuple):

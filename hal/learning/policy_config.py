@@ -50,17 +50,17 @@ _FOLLOWED = 0.9
 """Share of the rig's speeds that a step may use; the rest lets an arm that starts late catch up."""
 
 
-def _known_state(name: str) -> str:
+def _check_state(name: str) -> str:
     if name.rpartition(".")[2] not in STATES:
         raise ValueProblem(f"{name!r} is not one of {', '.join(STATES)}, nor one after an arm's name", "unknown_value")
     return name
 
 
-def _as_list(value: Any) -> Any:
+def _wrap_in_list(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
-StateName = Annotated[str, AfterValidator(_known_state)]
+StateName = Annotated[str, AfterValidator(_check_state)]
 PixelCount = Annotated[int, Field(ge=8, le=4096)]
 
 
@@ -75,7 +75,7 @@ class Source(Strict):
     """Order of height, width and channels."""
     mirror: Flag = False
     """Whether left and right of the picture are exchanged."""
-    state: Annotated[list[StateName] | None, BeforeValidator(_as_list)] = None
+    state: Annotated[list[StateName] | None, BeforeValidator(_wrap_in_list)] = None
     """Numbers, float32, one after the other: ``q`` (n,) rad, ``dq`` (n,) rad/s; of the tcp in the base frame
     ``tcp_position`` (3,) m, ``tcp_quaternion`` (4,) as x, y, z, w, ``tcp_rpy`` (3,) and ``tcp_rotvec`` (3,) rad; of the
     gripper ``width`` in m, ``open`` and ``closed`` from 0 to 1. ``left.q`` is that of the arm with this name."""
@@ -92,7 +92,7 @@ class Source(Strict):
     """Key of a map in the request that has this entry; None: the request itself."""
 
     @model_validator(mode="after")
-    def _one_source(self) -> Source:
+    def _check_source(self) -> Source:
         if sum(value is not None for value in (self.camera, self.state, self.objects, self.text)) != 1:
             raise ValueProblem("needs one of camera, state, objects and text", "conflict")
         return self
@@ -129,7 +129,7 @@ class GripperAction(Strict):
         return share if self.threshold is None else (share >= self.threshold).astype(float)
 
     @model_validator(mode="after")
-    def _differ(self) -> GripperAction:
+    def _check_ends(self) -> GripperAction:
         if self.open == self.closed:
             raise ValueProblem("open and closed must differ", "conflict")
         return self
@@ -230,7 +230,7 @@ class ActionConfig(Strict):
         """Return the joint positions (k, n) of steps (k, n), which begin at ``q``."""
         found = []
         for step in self.scale * actions:
-            q = q + _possible_share(robot, q, q + step, period) * step
+            q = q + _find_share(robot, q, q + step, period) * step
             found.append(q)
         return np.array(found)
 
@@ -240,10 +240,10 @@ class ActionConfig(Strict):
         for action in actions:
             step = np.concatenate([self.scale * action[:3], self.turn * action[3:]])
             try:
-                after = _moved(pose, step)
+                after = _move_pose(pose, step)
                 goal = robot.ik(after, q)
-                if (share := _possible_share(robot, q, goal, period)) < 1.0:
-                    after = _moved(pose, share * step)
+                if (share := _find_share(robot, q, goal, period)) < 1.0:
+                    after = _move_pose(pose, share * step)
                     goal = robot.ik(after, q)
             except Unreachable as error:
                 raise PolicyError(
@@ -254,12 +254,12 @@ class ActionConfig(Strict):
         return np.array(found)
 
 
-def _moved(pose: Pose, step: Array) -> Pose:
+def _move_pose(pose: Pose, step: Array) -> Pose:
     """Return a pose after a step (6,): a translation, m, and a rotation vector, rad, along the base's axes."""
     return Pose(pose.position + step[:3], after_rotation(pose.orientation.tolist(), step[3:].tolist()))
 
 
-def _possible_share(robot: Robot, q: Array, goal: Array, period: float) -> float:
+def _find_share(robot: Robot, q: Array, goal: Array, period: float) -> float:
     """Return the share of a step between joint positions that an arm covers in ``period`` s, at the rig's speeds.
 
     Policies that command speeds, such as DROID's, were trained on arms that move more slowly where they cannot follow.
@@ -289,14 +289,14 @@ class PolicyConfig(Strict):
     """Instead of ``action`` for a policy that moves several arms: the part of each."""
 
     @model_validator(mode="after")
-    def _maps_apart(self) -> PolicyConfig:
+    def _check_maps(self) -> PolicyConfig:
         for source in self.observation.values():
             if source.within in self.observation:
                 raise ValueProblem(f"{source.within} cannot be an entry and a map with entries", "conflict")
         return self
 
     @model_validator(mode="after")
-    def _arms_apart(self) -> PolicyConfig:
+    def _check_arms(self) -> PolicyConfig:
         if (self.action is None) == (self.arms is None):
             raise ValueProblem("needs an action, or arms with an action each", "missing_key")
         if self.arms is None:
@@ -321,7 +321,7 @@ class PolicyConfig(Strict):
         """Steps after the observation at which the first action of a chunk is due."""
         return self.actions[0].due
 
-    def with_size(self, height: int, width: int) -> PolicyConfig:
+    def resize_pictures(self, height: int, width: int) -> PolicyConfig:
         """Return this configuration with all pictures in another size, in pixels."""
         resized = {
             key: source if source.camera is None else source.model_copy(update={"size": (height, width)})
@@ -344,14 +344,14 @@ class PolicyConfig(Strict):
         """
         moved = [action.robot or robot.name for action in self.actions]
         seen = [arm for source in self.observation.values() for arm, _ in source.names if arm]
-        robots = _found("robots", [*moved, *seen], rig.robots)
-        _found("cameras", self.cameras(), rig.cameras)
+        robots = _find_devices("robots", [*moved, *seen], rig.robots)
+        _find_devices("cameras", self.cameras(), rig.cameras)
         if objects := [name for source in self.observation.values() for name in source.objects or ()]:
             if not rig.has_world:
                 raise NotSupported(
                     "the policy sees poses of objects, which only a simulation knows", code="policy_mismatch"
                 )
-            _found("objects", objects, dict.fromkeys(rig.world.bodies))
+            _find_devices("objects", objects, dict.fromkeys(rig.world.bodies))
         for name, action in zip(moved, self.actions, strict=True):
             arm, numbers = robots[name], action.numbers(robots[name].n)
             first, end = action.columns or (0, numbers)
@@ -393,14 +393,14 @@ class PolicyConfig(Strict):
                 color = observation.cameras[source.camera].frame.color
                 if color is None:
                     raise NotSupported(f"the policy needs colour of camera {source.camera}, which has none")
-                value = _picture(color, source)
+                value = _fit_picture(color, source)
             elif source.names:
-                numbers = [_state(name, observation, robots[arm] if arm else first) for arm, name in source.names]
-                value = _scaled(np.concatenate(numbers), source).astype(np.float32)
+                numbers = [_read_state(name, observation, robots[arm] if arm else first) for arm, name in source.names]
+                value = _scale(np.concatenate(numbers), source).astype(np.float32)
             elif source.objects is not None:
                 poses = rig.world.poses(source.objects).poses
                 parts = [part for name in source.objects for part in (poses[name].position, poses[name].orientation)]
-                value = _scaled(np.concatenate(parts), source).astype(np.float32)
+                value = _scale(np.concatenate(parts), source).astype(np.float32)
             (request if source.within is None else request.setdefault(source.within, {}))[key] = value
         return request
 
@@ -441,7 +441,7 @@ def load_policy_config(config: str | Path | Mapping[str, Any] | PolicyConfig) ->
     return load_record(PolicyConfig, config, "policies", "policy_config")
 
 
-def _found(kind: str, needed: Iterable[str], there: Mapping[str, T]) -> dict[str, T]:
+def _find_devices(kind: str, needed: Iterable[str], there: Mapping[str, T]) -> dict[str, T]:
     """Return the devices that are needed. Raises DeviceNotFound with both lists if one is missing."""
     names = list(dict.fromkeys(needed))
     if set(names) <= set(there):
@@ -452,7 +452,7 @@ def _found(kind: str, needed: Iterable[str], there: Mapping[str, T]) -> dict[str
     )
 
 
-def _scaled(numbers: Array, source: Source) -> Array:
+def _scale(numbers: Array, source: Source) -> Array:
     for factor in (source.scale, source.offset):
         if isinstance(factor, list) and len(factor) != numbers.size:
             names = ", ".join(source.objects or [name for _, name in source.names])
@@ -464,7 +464,7 @@ def _scaled(numbers: Array, source: Source) -> Array:
     return scaled
 
 
-def _state(name: str, observation: Observation, robot: Robot) -> Array:
+def _read_state(name: str, observation: Observation, robot: Robot) -> Array:
     state = observation.robots[robot.name]
     if name == "q":
         return np.asarray(state.q)
@@ -486,7 +486,7 @@ def _state(name: str, observation: Observation, robot: Robot) -> Array:
     return np.array([1.0 - grip if name == "open" else grip])
 
 
-def _picture(color: NDArray[np.uint8], source: Source) -> NDArray[np.uint8]:
+def _fit_picture(color: NDArray[np.uint8], source: Source) -> NDArray[np.uint8]:
     """Return a picture in the size and the layout of its source."""
     if source.size is not None and color.shape[:2] != source.size:
         from PIL import Image

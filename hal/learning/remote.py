@@ -334,7 +334,7 @@ class PolicyServer:
     async def _start(self) -> None:
         web = _aiohttp().web
         app = web.Application()
-        app.router.add_get("/healthz", self._healthy)
+        app.router.add_get("/healthz", self._answer_health)
         app.router.add_get("/", self._serve)
         self._runner = web.AppRunner(app, shutdown_timeout=0.1)
         await self._runner.setup()
@@ -343,7 +343,7 @@ class PolicyServer:
         self.port = site._server.sockets[0].getsockname()[1]
 
     @staticmethod
-    async def _healthy(_: Any) -> Any:
+    async def _answer_health(_: Any) -> Any:
         return _aiohttp().web.Response(text="OK")
 
     async def _serve(self, request: Any) -> Any:

@@ -27,8 +27,8 @@ __all__ = [
     "Deviation",
     "TrajectoryPlayer",
     "RecordedTrajectory",
-    "recorded_arms",
-    "other_moving_arms",
+    "list_recorded_arms",
+    "list_other_arms",
 ]
 
 Array = NDArray[np.float64]
@@ -136,13 +136,13 @@ class RecordedTrajectory:
         """
         if not 0.0 < speed <= 1.0:
             raise CommandError(f"speed must be above 0 and at most 1, not {speed:g}", code="bad_speed")
-        problems = self._other_arm(robot)
+        problems = self._check_arm(robot)
         if not problems:
-            problems = self._broken() or [*self._outside(robot), *self._too_fast(robot, speed)]
+            problems = self._check_rows() or [*self._check_limits(robot), *self._check_speed(robot, speed)]
         if problems:
             raise CommandError(f"{robot.name} cannot replay this: " + "; ".join(problems), code="cannot_replay")
 
-    def _other_arm(self, robot: Robot) -> list[str]:
+    def _check_arm(self, robot: Robot) -> list[str]:
         if self.model and self.model != robot.spec.model:
             return [f"it was recorded with the model {self.model}, and this arm is a {robot.spec.model}"]
         if self.joints != robot.joints:
@@ -151,7 +151,7 @@ class RecordedTrajectory:
             return ["it was recorded with a gripper, and this arm has none"]
         return []
 
-    def _broken(self) -> list[str]:
+    def _check_rows(self) -> list[str]:
         if len(self.t) < 2:
             return [f"it has {len(self.t)} row(s); nothing to replay"]
         if not np.isfinite(self.q_set).all():
@@ -159,7 +159,7 @@ class RecordedTrajectory:
             return [f"its set-point at {self.t[row]:.3f} s is not a number"]
         return []
 
-    def _outside(self, robot: Robot) -> list[str]:
+    def _check_limits(self, robot: Robot) -> list[str]:
         limits, found = robot.limits, []
         for name, values, low, high in zip(self.joints, self.q_set.T, limits.lower, limits.upper, strict=True):
             if values.min() < low - _ROUNDED or values.max() > high + _ROUNDED:
@@ -171,10 +171,10 @@ class RecordedTrajectory:
                 found.append(f"the fingers press with {force:g} N, and with at most {most:g} N here")
         return found
 
-    def _too_fast(self, robot: Robot, speed: float) -> list[str]:
+    def _check_speed(self, robot: Robot, speed: float) -> list[str]:
         """Describe a speed at which the servo would limit the motion, so that the arm would lag behind."""
         most = robot.spec.speed * np.asarray(robot.limits.velocity)
-        share, row, worst = max(self._fastest(span, most) for span in _SPANS)
+        share, row, worst = max(self._find_fastest(span, most) for span in _SPANS)
         if share * speed <= _SPEED_ROOM:
             return []
         return [
@@ -182,7 +182,7 @@ class RecordedTrajectory:
             f"{most[worst]:.3f} here: at speed {np.floor(100.0 / share) / 100.0:g} it could"
         ]
 
-    def _fastest(self, span: float, most: Array) -> tuple[float, int, int]:
+    def _find_fastest(self, span: float, most: Array) -> tuple[float, int, int]:
         """Return the highest mean speed over ``span`` s, as a share of ``most``, with its first row and its joint."""
         last = len(self.t) - 1
         ends = np.minimum(np.searchsorted(self.t, self.t + span - _ROUNDED), last)
@@ -193,7 +193,7 @@ class RecordedTrajectory:
         row, joint = np.unravel_index(int(shares.argmax()), shares.shape)
         return float(shares[row, joint]), int(starts[row]), int(joint)
 
-    def at(self, values: Array, s: float) -> Array:
+    def interpolate(self, values: Array, s: float) -> Array:
         """Return the row of ``values``, one of the arrays above, interpolated at ``s``, s since the first row."""
         k = min(max(int(np.searchsorted(self.t, s, side="right")), 1), len(self.t) - 1)
         share = min(max((s - self.t[k - 1]) / (self.t[k] - self.t[k - 1]), 0.0), 1.0)
@@ -208,14 +208,14 @@ class RecordedTrajectory:
         return (width, force if math.isfinite(force) else None) if math.isfinite(width) else None
 
 
-def recorded_arms(episode: Episode) -> list[str]:
+def list_recorded_arms(episode: Episode) -> list[str]:
     """Return the names of the arms in the recording."""
     return [key.removeprefix("robot.") for key in episode.stamps if key.startswith("robot.")]
 
 
-def other_moving_arms(episode: Episode, name: str) -> list[str]:
+def list_other_arms(episode: Episode, name: str) -> list[str]:
     """Return the names of the other arms that moved in the recording, which a replay of arm ``name`` leaves out."""
-    arms, names = recorded_arms(episode), episode.names("rig.setpoint")
+    arms, names = list_recorded_arms(episode), episode.names("rig.setpoint")
     setpoint = np.asarray(episode.columns["rig.setpoint"], float)
     found = []
     for arm in arms if len(arms) > 1 else ():
@@ -383,7 +383,7 @@ class TrajectoryPlayer:
             )
         spec = self.robot.spec
         self.robot.move_to(
-            self._inside(self.trajectory.q_set[0]),
+            self._clip(self.trajectory.q_set[0]),
             deadman=self._deadman,
             unattended=self._unattended,
             speed=None if spec.attended else spec.speed,
@@ -428,7 +428,7 @@ class TrajectoryPlayer:
                     self.finished = True
                     return
 
-    def _inside(self, q: Array) -> Array:
+    def _clip(self, q: Array) -> Array:
         """Return ``q`` within the limits: rounding may have moved a recorded set-point out of them."""
         limits = self.robot.limits
         found: Array = np.clip(q, limits.lower, limits.upper)
@@ -437,7 +437,7 @@ class TrajectoryPlayer:
     def _begin(self, now: float) -> TimeScaling:
         """Return the scaling that continues from :attr:`progress`, after the time to get there slowly."""
         state, spec = self.robot.state(), self.robot.spec
-        away = np.abs(self.trajectory.at(self.trajectory.q_set, self.progress) - state.q_set)
+        away = np.abs(self.trajectory.interpolate(self.trajectory.q_set, self.progress) - state.q_set)
         slowly = spec.move_speed * np.asarray(spec.limits.velocity)
         return TimeScaling(now + _JOIN + 2.0 * float((away / slowly).max()), self.progress, self.speed)
 
@@ -451,7 +451,7 @@ class TrajectoryPlayer:
             times, points = [now], [self.robot.state().q_set]
         if now < scaling.t:  # from where it rests to where it begins
             times.append(scaling.t)
-            points.append(trajectory.at(trajectory.q_set, scaling.s))
+            points.append(trajectory.interpolate(trajectory.q_set, scaling.s))
         for k in range(begin, min(last, len(trajectory.t))):
             if trajectory.t[k] > scaling.s:
                 times.append(scaling.time_at(float(trajectory.t[k])))
@@ -470,8 +470,8 @@ class TrajectoryPlayer:
                 continue  # braking
             self.progress = min(scaling.progress_at(seen), trajectory.duration)
             if scaling.progress_at(seen) <= trajectory.duration:
-                off = state.q - trajectory.at(trajectory.q, self.progress)
-                self.deviation.add(off, state.tcp.position - trajectory.at(trajectory.tcp, self.progress))
+                off = state.q - trajectory.interpolate(trajectory.q, self.progress)
+                self.deviation.add(off, state.tcp.position - trajectory.interpolate(trajectory.tcp, self.progress))
             self.limited |= state.limited
         return seen
 

@@ -347,7 +347,7 @@ class _Worlds:
             self._write(self._records.observations, k, seen)
             return info
 
-        return self._each(reset)
+        return self._run_each(reset)
 
     def step(self) -> str | None:
         """Step every world; return their packed infos, without those in shared memory; None if nothing is left."""
@@ -372,7 +372,7 @@ class _Worlds:
             return info
 
         try:
-            infos = self._each(step)
+            infos = self._run_each(step)
             return _pack(infos) if any(infos) else None
         finally:
             self._stepped = time.monotonic()
@@ -387,7 +387,7 @@ class _Worlds:
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
         """Call a method of every world, or read an attribute."""
         found = [env.get_wrapper_attr(name) for env in self._envs]
-        return self._each(lambda k: found[k](*args, **kwargs) if callable(found[k]) else found[k])
+        return self._run_each(lambda k: found[k](*args, **kwargs) if callable(found[k]) else found[k])
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
         """Set an attribute of every world."""
@@ -398,7 +398,7 @@ class _Worlds:
         for key, values in seen.items():
             records[key][self._first + k] = values
 
-    def _each(self, run: Callable[[int], Any]) -> list[Any]:
+    def _run_each(self, run: Callable[[int], Any]) -> list[Any]:
         """Run a function for every world, and raise the first world's error after all.
 
         Each time in the other direction: the worlds that were last are still in the processor's cache.

@@ -140,26 +140,30 @@ class ArmMotion:
         if self._result is not None:
             return self._result
         servo = self._peek()
-        mine = servo.session == self._id
-        trip = servo.trip if mine else Trip.NONE
-        if mine and servo.arrived:
-            outcome = MotionOutcome.ARRIVED
-        elif mine and (trip or servo.off_path or servo.status in _FAULTY):
-            if any(servo.dq_set) and servo.status is not RobotStatus.LOST:
-                return None
-            outcome = MotionOutcome.STOPPED
-        elif not mine and self._robot._mail.state.seq() > self._session._opened:
-            outcome = MotionOutcome.CANCELLED if self._cancelled else MotionOutcome.STOPPED
-        else:
+        outcome = self._find_outcome(servo)
+        if outcome is None:
             return None
         state = self._robot._mail.get_state()
         assert state is not None
         progress = 1.0 if outcome is MotionOutcome.ARRIVED else servo.progress
+        trip = servo.trip if servo.session == self._id else Trip.NONE
         self._result = ArmMotionResult(outcome, progress, state, servo.held_back, trip)
         if trip or servo.status in _FAULTY:
             self._session._report_stop()
         self._session.brake()
         return self._result
+
+    def _find_outcome(self, servo: ServoRecord) -> MotionOutcome | None:
+        """Return how the motion ended; None while it runs or brakes."""
+        if servo.session != self._id:
+            if self._robot._mail.state.seq() <= self._session._opened:
+                return None
+            return MotionOutcome.CANCELLED if self._cancelled else MotionOutcome.STOPPED
+        if servo.arrived:
+            return MotionOutcome.ARRIVED
+        ended = servo.trip or servo.off_path or servo.status in _FAULTY
+        rests = servo.status is RobotStatus.LOST or not any(servo.dq_set)
+        return MotionOutcome.STOPPED if ended and rests else None
 
     # The blocking form.
 
@@ -175,7 +179,7 @@ class ArmMotion:
         with session:
             for _ in clock.rate(CHECK_HZ):
                 servo = session._peek()
-                session._check_trip(servo, clock.now())
+                session._check_trip(servo)
                 if servo.session == session._id:
                     if servo.off_path:
                         raise MotionStopped(

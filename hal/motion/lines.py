@@ -45,7 +45,7 @@ class Segment:
     """In units of s."""
 
     @classmethod
-    def between(cls, start: Floats, end: Floats) -> Segment | None:
+    def connect(cls, start: Floats, end: Floats) -> Segment | None:
         """Return the segment between two poses (7,); None if they are the same."""
         way = difference(start, end)
         length = max(hypot(*way[:3]), METRES_PER_RADIAN * hypot(*way[3:]))
@@ -55,15 +55,15 @@ class Segment:
 
     def at(self, s: float) -> list[float]:
         """Return the pose (7,) at ``s`` from the start."""
-        return _moved(self.start, [x * s for x in self.direction])
+        return _move_pose(self.start, [x * s for x in self.direction])
 
     def cosine(self, other: Segment) -> float:
         """Return the cosine of the angle to another segment: of translation and rotation together."""
-        a, b = self._weighted(), other._weighted()
+        a, b = self._weigh(), other._weigh()
         dot = sum(x * y for x, y in zip(a, b, strict=True))
         return dot / (hypot(*a) * hypot(*b))
 
-    def _weighted(self) -> list[float]:
+    def _weigh(self) -> list[float]:
         return self.direction[:3] + [METRES_PER_RADIAN * x for x in self.direction[3:]]
 
 
@@ -91,8 +91,8 @@ class Corner:
         u = s / self.length
         done = u * u * u * (1.0 - 0.5 * u)
         left = self.cut - self.length * (u - done)
-        pose = _moved(self.after.start, [x * self.length * done for x in self.after.direction])
-        return _moved(pose, [-x * left for x in self.before.direction])
+        pose = _move_pose(self.after.start, [x * self.length * done for x in self.after.direction])
+        return _move_pose(pose, [-x * left for x in self.before.direction])
 
 
 class TcpLine:
@@ -144,7 +144,7 @@ def tcp_lines(poses: Sequence[Floats], blend: float) -> list[TcpLine]:
     """
     segments: list[Segment] = []
     for pose in poses[1:]:
-        segment = Segment.between(segments[-1].end if segments else poses[0], pose)
+        segment = Segment.connect(segments[-1].end if segments else poses[0], pose)
         if segment is not None:
             segments.append(segment)
     lines: list[TcpLine] = []
@@ -167,7 +167,7 @@ def tcp_lines(poses: Sequence[Floats], blend: float) -> list[TcpLine]:
     return lines
 
 
-def _moved(pose: Floats, way: Floats) -> list[float]:
+def _move_pose(pose: Floats, way: Floats) -> list[float]:
     """Return a pose (7,) after a translation and a rotation vector (6,) along the base's axes."""
     x, y, z, *orientation = pose
     return [x + way[0], y + way[1], z + way[2], *after_rotation(orientation, way[3:])]

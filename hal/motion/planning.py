@@ -97,7 +97,7 @@ class PathPlanner:
         self._check = check
         self._step = step
 
-    def along_poses(self, q: Floats, poses: Sequence[Floats], blend: float = 0.0) -> MotionPlan:
+    def plan_poses(self, q: Floats, poses: Sequence[Floats], blend: float = 0.0) -> MotionPlan:
         """Plan straight lines of the tcp.
 
         Args:
@@ -119,9 +119,9 @@ class PathPlanner:
             sections.append(section)
             q = section.q[-1]
             done += line.length
-        return self._checked(sections, whole)
+        return self._check_plan(sections, whole)
 
-    def along_joints(self, q: Floats, points: Sequence[Floats], blend: float = 0.0) -> MotionPlan:
+    def plan_joints(self, q: Floats, points: Sequence[Floats], blend: float = 0.0) -> MotionPlan:
         """Plan a way that is straight in joint space between waypoints, and rests at corners that are not rounded.
 
         Args:
@@ -133,7 +133,7 @@ class PathPlanner:
             Unreachable: The way leaves the workspace, or does not pass the further check.
             CommandError: It has too many waypoints (``code`` is ``path_too_long``).
         """
-        sections = _joint_sections([np.array(point, float) for point in (q, *points)], blend)
+        sections = _make_sections([np.array(point, float) for point in (q, *points)], blend)
         whole = sum(section.s[-1] for section in sections)
         fk = self._arm.fk
         begun = fk(q)
@@ -144,7 +144,7 @@ class PathPlanner:
                 joints = path.at(s)[0]
                 self._check_place(fk(joints), begun, done + s, whole, joints)
             done += section.s[-1]
-        return self._checked(sections, whole)
+        return self._check_plan(sections, whole)
 
     # Inverse kinematics along a line.
 
@@ -167,7 +167,7 @@ class PathPlanner:
             else:
                 self._refuse(rows[-1], pose, found, done + start, whole, lower, upper)
         for _ in range(_REFINEMENTS):
-            wrong = self._off_line(line, knots, rows)
+            wrong = self._find_off_line(line, knots, rows)
             for k in reversed(wrong):
                 middle = 0.5 * (knots[k] + knots[k + 1])
                 found = self._solve(line.at(middle), 0.5 * (rows[k] + rows[k + 1]), 0.0, lower, upper)
@@ -210,13 +210,13 @@ class PathPlanner:
             error: Array = np.array(way_left)
             if aside is not None:
                 error -= jacobian @ aside
-            step = _least_step(jacobian, error)
+            step = _solve_step(jacobian, error)
             if aside is not None:
                 step, aside = step + aside, None
             q = q + step
         return None
 
-    def _off_line(self, line: TcpLine, knots: list[float], rows: list[Array]) -> list[int]:
+    def _find_off_line(self, line: TcpLine, knots: list[float], rows: list[Array]) -> list[int]:
         """Return the intervals between two knots in whose middle the spline is off the line."""
         path = JointPath(PathSection(tuple(knots), tuple(rows)))  # type: ignore[arg-type]  # rows of numbers
         wrong = []
@@ -277,7 +277,7 @@ class PathPlanner:
                     code="outside_workspace",
                 )
 
-    def _checked(self, sections: Sequence[PathSection], whole: float) -> MotionPlan:
+    def _check_plan(self, sections: Sequence[PathSection], whole: float) -> MotionPlan:
         """Return the plan, if it is short enough and passes the further check."""
         count = sum(len(section.s) for section in sections)
         if count > PATH_KNOTS:
@@ -294,7 +294,7 @@ class PathPlanner:
         return MotionPlan(tuple(sections), whole)
 
 
-def _least_step(jacobian: Array, error: Array) -> Array:
+def _solve_step(jacobian: Array, error: Array) -> Array:
     """Return the shortest step of the joints (k,) that moves the tcp by ``error`` (6,), to first order."""
     gram = jacobian @ jacobian.T
     gram.flat[::7] += _DAMPING
@@ -312,7 +312,7 @@ def _places(section: PathSection) -> list[float]:
     return places
 
 
-def _joint_sections(points: Sequence[Array], blend: float) -> list[PathSection]:
+def _make_sections(points: Sequence[Array], blend: float) -> list[PathSection]:
     """Return the sections of a way along waypoints (n,), rad, with corners as :class:`~hal.motion.lines.Corner`'s."""
     kept = [points[0]]
     for point in points[1:]:
@@ -332,23 +332,27 @@ def _joint_sections(points: Sequence[Array], blend: float) -> list[PathSection]:
             s.append(place + way * k / count)
 
     for k, (length, direction) in enumerate(zip(lengths, directions, strict=True)):
-        after = directions[k + 1] if k + 1 < len(directions) else None
-        cosine = float(direction @ after) if after is not None else -1.0
-        cut = min(blend, 0.5 * length, 0.5 * lengths[k + 1]) if after is not None and cosine > REVERSAL else 0.0
-        curved = after is not None and cut > _SAME and cosine < STRAIGHT_ON
-        cut = cut if curved else 0.0
+        corner, cut = kept[k + 1], _find_cut(lengths, directions, k, blend)
         straight = length - begun - cut
         if straight > _SAME:  # knots near a corner, whose curvature must not spread over a long straight part
-            go(kept[k + 1] - cut * direction, straight, ceil(straight / (cut or begun)) if cut or begun else 1)
+            go(corner - cut * direction, straight, ceil(straight / (cut or begun)) if cut or begun else 1)
         begun = cut
-        if after is not None and curved:
+        if cut:
             place = s[-1]
             for i in range(1, _CORNER + 1):
                 u = i / _CORNER
                 done = u * u * u * (1.0 - 0.5 * u)
-                q.append(kept[k + 1] - (cut - 2.0 * cut * (u - done)) * direction + 2.0 * cut * done * after)
+                q.append(corner - (cut - 2.0 * cut * (u - done)) * direction + 2.0 * cut * done * directions[k + 1])
                 s.append(place + 2.0 * cut * u)
-        elif cosine < STRAIGHT_ON:
+        elif k + 1 == len(lengths) or float(direction @ directions[k + 1]) < STRAIGHT_ON:
             sections.append(PathSection(tuple(s), tuple(tuple(row.tolist()) for row in q)))
-            s, q = [0.0], [kept[k + 1]]
+            s, q = [0.0], [corner]
     return sections
+
+
+def _find_cut(lengths: Floats, directions: Sequence[Array], k: int, blend: float) -> float:
+    """Return how far from the end of way ``k`` its corner with the next begins, rad; 0 if that is not rounded."""
+    if k + 1 == len(lengths):
+        return 0.0
+    cut = min(blend, 0.5 * lengths[k], 0.5 * lengths[k + 1])
+    return cut if cut > _SAME and REVERSAL < float(directions[k] @ directions[k + 1]) < STRAIGHT_ON else 0.0

@@ -12,7 +12,7 @@ from ..errors import DeviceNotFound, DriverMissing, NotSupported
 from ..registry import PadInput
 from ..specs import PadSpec
 
-__all__ = ["TOUR", "Chosen", "check_wanted", "choose_pad", "pad_choices", "tour"]
+__all__ = ["TOUR", "Chosen", "check_wanted", "choose_pad", "pad_choices", "play_tour"]
 
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
@@ -48,7 +48,7 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
     """Choose the driver of a gamepad whose driver is ``auto``; any other gamepad stays as it is.
 
     ``auto`` is a gamepad that is plugged in, else the console, which any browser can drive. In lock-step, where nothing
-    can be driven by hand, it is the recorded tour.
+    can be driven by hand, it is the recorded tour, unless the rig wants a real pad (:attr:`.PadSpec.real`).
 
     Args:
         spec: The gamepad of the rig file.
@@ -58,25 +58,28 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
         emulated: Whether every real device is an emulator, so that a recording may drive it.
 
     Raises:
-        DeviceNotFound: No such choice or recording, or no gamepad for a real arm in lock-step.
-        NotSupported: A recording for a real arm.
+        DeviceNotFound: No such choice or recording, or no gamepad for a real arm, or a real pad, in lock-step.
+        NotSupported: A recording for a real arm, or in the place of a real pad.
     """
     if spec.driver != _AUTO:
         return Chosen(spec)
     check_wanted(wanted)
     if wanted in (None, _AUTO):
-        return _first(spec, attended and not emulated, lock_step)
+        return _choose_auto(spec, attended and not emulated, lock_step)
     if wanted == registry.pad_driver("plugged"):
-        pads, notes = _plugged()
+        pads, notes = _list_plugged()
         missing = () if pads else ("no gamepad is plugged in yet: plug one in at any time",)
         return Chosen(replace(spec, driver=wanted), (*notes, *missing))
     if wanted in pad_choices() and wanted != _DEMO:
         return Chosen(replace(spec, driver=wanted))
+    if spec.real:
+        text = f"gamepads.{spec.name}.sim is false: a recording is no real pad; leave that key out, or the recording"
+        raise NotSupported(text, code="recording_of_real_pad")
     if attended and not emulated:
         text = _NO_RECORDING.format(console=registry.pad_driver("console"))
         raise NotSupported(text, code="recording_on_real_arm")
     notes = ("a recording holds the dead-man: every real device here is emulated",) if attended else ()
-    return Chosen(tour(spec) if wanted == _DEMO else _recording(spec, Path(str(wanted))), notes)
+    return Chosen(play_tour(spec) if wanted == _DEMO else _play_file(spec, Path(str(wanted))), notes)
 
 
 def check_wanted(wanted: str | None) -> None:
@@ -90,24 +93,25 @@ def check_wanted(wanted: str | None) -> None:
         raise DeviceNotFound(f"there is no pad {wanted!r}: {choices}, or the path of a recording (.jsonl)")
 
 
-def tour(spec: PadSpec) -> PadSpec:
+def play_tour(spec: PadSpec) -> PadSpec:
     """Return ``spec`` with the recorded tour as its driver."""
-    return _recording(spec, find_data(*TOUR))
+    return _play_file(spec, find_data(*TOUR))
 
 
-def _first(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
-    pads, notes = _plugged()
+def _choose_auto(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
+    pads, notes = _list_plugged()
     if pads:
         return Chosen(replace(spec, driver=registry.pad_driver("plugged")), notes)
     if not lock_step:
         return Chosen(replace(spec, driver=registry.pad_driver("console")), notes)
-    if attended:
-        text = "no gamepad is plugged in, and a real arm does not move without one: plug one in"
+    if attended or spec.real:
+        why = "a real arm does not move without one" if attended else f"gamepads.{spec.name}.sim is false"
+        text = f"no gamepad is plugged in, and {why}: plug one in"
         raise DeviceNotFound("; ".join([text, *notes]), code="no_gamepad")
-    return Chosen(tour(spec), (*notes, "lock-step cannot be driven by hand: playing the recorded tour"))
+    return Chosen(play_tour(spec), (*notes, "lock-step cannot be driven by hand: playing the recorded tour"))
 
 
-def _plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _list_plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the gamepads that are plugged in, and notes."""
     try:
         found = registry.load(registry.pad_driver("plugged"), "gamepad").plugged()
@@ -116,5 +120,5 @@ def _plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
     return found.pads, found.notes
 
 
-def _recording(spec: PadSpec, path: Path) -> PadSpec:
+def _play_file(spec: PadSpec, path: Path) -> PadSpec:
     return replace(spec, driver=registry.pad_driver("recording"), options={"file": str(path)})

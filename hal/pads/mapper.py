@@ -28,7 +28,7 @@ class AxisRange(NamedTuple):
     flat: int = 0
     """Distance from the middle that counts as rest."""
 
-    def normalised(self, value: int, trigger: bool) -> float:
+    def normalise(self, value: int, trigger: bool) -> float:
         """Return a value from -1 to 1 for a stick, from 0 to 1 for a trigger."""
         share = (value - self.minimum) / (self.maximum - self.minimum)
         share = min(1.0, max(0.0, share))
@@ -42,7 +42,7 @@ class _Axis(NamedTuple):
 
     def value(self, raw: int) -> float:
         """Return the canonical value."""
-        return self.sign * self.range.normalised(raw, self.control in _TRIGGERS) + 0.0  # no -0.0
+        return self.sign * self.range.normalise(raw, self.control in _TRIGGERS) + 0.0  # no -0.0
 
 
 class PadMapper:
@@ -82,7 +82,7 @@ class PadMapper:
         directions = {control[1:] for control in pressed if control[0] in "+-"}
         self._controls = (*sorted(reported | directions), *self._computed_axes)
         self.flat: Mapping[str, float] = {
-            axis.control: axis.range.flat / (axis.range.maximum - axis.range.minimum) * _spread(axis.control)
+            axis.control: axis.range.flat / (axis.range.maximum - axis.range.minimum) * _measure_range(axis.control)
             for axis in axes
         }
         """Share of each axis' travel from neutral that the pad declares as rest."""
@@ -187,6 +187,6 @@ class PadMapper:
         self.buttons = self.buttons | {control} if down else self.buttons - {control}
 
 
-def _spread(control: str) -> float:
+def _measure_range(control: str) -> float:
     """Return the length of an axis' canonical range."""
     return 1.0 if control in _TRIGGERS else 2.0

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
-from ..config.files import Problems, nearest, validate
+from ..config.files import Problems, suggest, validate
 from ..config.schema import Strict, ValueProblem
 from ..types import AXES, BUTTONS
 from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
@@ -24,7 +24,7 @@ __all__ = [
     "guess_model",
     "guess_warning",
     "pad_model",
-    "validated",
+    "check_record",
 ]
 
 PRINTED: Mapping[str, Mapping[str, str]] = {
@@ -87,10 +87,10 @@ class Identity(NamedTuple):
         return _BUSES.get(self.bus, "other")
 
 
-def _known(kind: str, names: Collection[str]) -> AfterValidator:
+def _check_name(kind: str, names: Collection[str]) -> AfterValidator:
     def check(name: str) -> str:
         if name not in names:
-            raise ValueProblem(f"{name!r} is not a known {kind}{nearest(name, names)}", "unknown_control")
+            raise ValueProblem(f"{name!r} is not a known {kind}{suggest(name, names)}", "unknown_control")
         return name
 
     return AfterValidator(check)
@@ -120,7 +120,7 @@ class MatchRule(Strict):
     """Part of the device's name; the case does not matter."""
     driver: str | None = None
     """The kernel's driver: the same pad has other event codes with another driver."""
-    bus: Annotated[str, _known("bus", ("usb", "bluetooth"))] | None = None
+    bus: Annotated[str, _check_name("bus", ("usb", "bluetooth"))] | None = None
     wireless: bool = False
     """Whether the device is only the receiver of a wireless pad, so that it stays when the pad is gone."""
     title: str | None = None
@@ -145,12 +145,12 @@ class PadModel(Strict):
     title: str
     """Name to display."""
     match: tuple[MatchRule, ...] = ()
-    axes: dict[Annotated[str, _known("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
+    axes: dict[Annotated[str, _check_name("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
     """Event code -> axis, or ``-axis`` where the kernel's value grows the other way (on sticks, downwards). Codes that
     a pad does not send are allowed."""
-    buttons: dict[Annotated[str, _known("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
+    buttons: dict[Annotated[str, _check_name("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
     """Event code -> button; ``+dpad_y`` etc. where the directions of the d-pad are buttons."""
-    ranges: dict[Annotated[str, _known("event code of an axis", _AXIS_CODES)], tuple[int, int]] = Field(
+    ranges: dict[Annotated[str, _check_name("event code of an axis", _AXIS_CODES)], tuple[int, int]] = Field(
         default_factory=dict
     )
     """Event code -> (minimum, maximum): required for ``REL_`` axes, which report none, and for axes whose reported
@@ -159,7 +159,7 @@ class PadModel(Strict):
     """End of the name of the pad's motion sensor, which reports all the time and so shows that the pad is connected."""
     touch_node: str | None = None
     """End of the name of the pad's touchpad, a separate device; pressing it is the button ``touchpad``."""
-    printed: Annotated[str, _known("family of pads", PRINTED)] | None = None
+    printed: Annotated[str, _check_name("family of pads", PRINTED)] | None = None
     """Family of pads (of :data:`PRINTED`) whose names of the controls this pad has; None for plain names."""
     mapping: str | None = None
     """Teleoperation mapping for this pad (``config/teleop``); default: ``default``."""
@@ -176,7 +176,7 @@ class PadModel(Strict):
             raise ValueProblem(f"needs ranges of {', '.join(missing)}, such as [-350, 350]", "missing_key")
         return self
 
-    def rule_for(self, pad: Identity) -> MatchRule | None:
+    def find_rule(self, pad: Identity) -> MatchRule | None:
         """Return the rule with the most matching properties; None if the model does not match."""
         best = max(self.match, key=lambda rule: rule.fits(pad), default=None)
         return best if best is not None and best.fits(pad) else None
@@ -189,7 +189,7 @@ class PadModel(Strict):
         return re.sub(r"(vendor|product): (\d+)$", lambda m: f"{m[1]}: 0x{int(m[2]):04x}", text, flags=re.MULTILINE)
 
 
-def validated(cls: type[_M], data: Mapping[str, Any], file: str) -> _M:
+def check_record(cls: type[_M], data: Mapping[str, Any], file: str) -> _M:
     """Return ``data`` as a record. Raises ConfigError, which lists every problem; ``file`` is the name in them."""
     problems = Problems()
     record = validate(cls, data, file, problems)
@@ -199,14 +199,14 @@ def validated(cls: type[_M], data: Mapping[str, Any], file: str) -> _M:
 
 def pad_model(data: Mapping[str, Any], file: str = "<gamepad model>") -> PadModel:
     """Return a checked model. Raises ConfigError, which lists every problem; ``file`` is its name in them."""
-    return validated(PadModel, data, file)
+    return check_record(PadModel, data, file)
 
 
 def choose_model(models: Iterable[PadModel], pad: Identity) -> tuple[PadModel, MatchRule] | None:
     """Return the model with the most specific rule for a pad, and that rule; None for an unknown pad."""
     best: tuple[PadModel, MatchRule] | None = None
     for model in models:
-        rule = model.rule_for(pad)
+        rule = model.find_rule(pad)
         if rule is not None and (best is None or rule.fits(pad) > best[1].fits(pad)):
             best = model, rule
     return best

@@ -88,7 +88,7 @@ class RowQueue:
     @staticmethod
     def size(width: int, cameras: Sequence[CameraSetup], slots: int) -> int:
         """Return the number of bytes that the queue needs."""
-        return _status_size() + ArrayRing.bytes_of(_arrays(width, cameras), slots)
+        return _status_size() + ArrayRing.count_bytes(_arrays(width, cameras), slots)
 
     # In the app.
 

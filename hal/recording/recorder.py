@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import CommandError, ConnectionLost, HalError, StaleStateError
-from ..host.hosts import groups_of
+from ..host.hosts import make_groups
 from ..host.process import Child, SharedMemory
 from ..learning.episode import stands_in_world
 from .checking import check_compatible, known_columns
@@ -548,7 +548,7 @@ class BackgroundSave:
 
 def check_rate(rig: Rig, fps: int) -> None:
     """Raise CommandError if a lock-step simulation makes fewer steps per second than ``fps``."""
-    if rig.lock_step and fps > (steps := groups_of(rig.plan)[0].rate_hz):
+    if rig.lock_step and fps > (steps := make_groups(rig.plan)[0].rate_hz):
         raise CommandError(
             f"fps must be at most {steps:g}, the steps of this simulation per second, not {fps}", code="bad_fps"
         )

@@ -226,12 +226,14 @@ class Anchoring:
         # The speeds distinguish a small loss from none: they are a thousand times as exact as the positions.
         close = max(cycles * _CLOSE, step_off / _CLOSER)
         is_lost = lost_off <= cycles * _ROUNDED and lost_step_off < min(step_off, close)
-        self._judge(reading, lost_off if is_lost else off)
-        track, count = (lost, cycles) if is_lost else (took, cycles - 1)
+        track, count, start = took, cycles - 1, self._motion[0]
+        if is_lost:
+            track, count, start, off, step_off = lost, cycles, self._track[0], lost_off, lost_step_off
+        self._judge(reading, off)
         self.lost += count
-        agreed = (lost_step_off if is_lost else step_off) <= cycles * _ROUNDED
+        agreed = step_off <= cycles * _ROUNDED
         if agreed and dq is not None and self._dq is not None:
-            track = self._refined(self._track[0] if is_lost else self._motion[0], cycles, int(is_lost), self._dq, dq)
+            track = self._refined(start, cycles, int(is_lost), self._dq, dq)
         self._dq = dq if agreed else None
         if count and not self._allows(at := self._state(track)):
             self._note_taken()

@@ -65,7 +65,16 @@ class _Course:
 
 
 class Servo:
-    """Makes the set-points of one arm, once per ``dt`` seconds."""
+    """Makes the set-points of one arm, once per ``dt`` seconds.
+
+    Args:
+        spec: The arm.
+        dt: Time between two ticks, s.
+        kinematics: The arm's kinematics, if they are loaded already.
+        mass_matrix: Inertia of a device that takes torques; without it, torque commands are refused.
+        extrapolates: What the device does when a set-point is lost (see :attr:`.RobotDriver.extrapolates`).
+        simulated: Whether the arm has the joint damping of its URDF, which controllers then compensate.
+    """
 
     def __init__(
         self,
@@ -76,16 +85,6 @@ class Servo:
         extrapolates: bool = False,
         simulated: bool = False,
     ) -> None:
-        """Make the servo of one arm.
-
-        Args:
-            spec: The arm.
-            dt: Time between two ticks, s.
-            kinematics: The arm's kinematics, if they are loaded already.
-            mass_matrix: Inertia of a device that takes torques; without it, torque commands are refused.
-            extrapolates: What the device does when a set-point is lost (see :attr:`.RobotDriver.extrapolates`).
-            simulated: Whether the arm has the joint damping of its URDF, which controllers then compensate.
-        """
         self.spec = spec
         self.kinematics = Kinematics(spec.kinematics) if kinematics is None else kinematics
         self.report = ServoReport()
@@ -248,8 +247,6 @@ class Servo:
         compared, self._compared = self._compared, False
         self._envelope.limited = Limited.REANCHORED if compared and self._corrected else _UNLIMITED
         device = self._device if compared else self._find_trip(now, reading)
-        if session is None:
-            self._anchoring.note_rest(None if device else reading.q_commanded)
         streamed = session is not None and not self._torque.active
         device = self._observe(reading, device)
         if streamed and not compared:
@@ -270,6 +267,8 @@ class Servo:
 
     def _observe(self, reading: Reading, device: Trip) -> Trip:
         """Take what the arm measured; return ``device``, or the trip of an arm that torques have driven too far."""
+        if self._session is None:
+            self._anchoring.note_rest(None if device else reading.q_commanded)
         torque = self._torque
         known = self._is_known(reading, device)
         self.possible = known or device is Trip.DEVICE_LOST

@@ -33,7 +33,7 @@ __all__ = [
     "look_at",
     "locate_by_depth",
     "read_frames",
-    "points_of",
+    "collect_points",
     "find_table",
     "largest_cluster",
     "Plane",
@@ -85,7 +85,7 @@ def read_frames(camera: Camera, count: int = 5) -> list[Frame]:
     return frames
 
 
-def points_of(arm: Robot, frames: Sequence[Frame]) -> Array:
+def collect_points(arm: Robot, frames: Sequence[Frame]) -> Array:
     """Return the points (k, 3) that frames of one resting camera show, in the arm's base frame, m.
 
     The depth of a pixel is the median over the frames that measured it.
@@ -174,7 +174,7 @@ def locate_by_depth(
     Raises:
         CommandError: The frames have no depth, or the camera's pose is unknown.
     """
-    points = points_of(arm, frames)
+    points = collect_points(arm, frames)
     away = np.hypot(points[:, 0], points[:, 1])
     inside = (away > _REACH[0]) & (away < _REACH[1])
     if lower is not None:

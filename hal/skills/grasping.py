@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..arguments import number
 from ..geometry import Pose, tcp_pose
-from .running import SkillOptions, SkillResult, SkillRun, above, flipped
+from .running import SkillOptions, SkillResult, SkillRun, flip_pose, lift_pose
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -183,8 +183,8 @@ def plan_grasp(
     gripper = run.gripper
     if width is not None and number("width", width, "m", least=0.0) > gripper.width_max:
         run.fail("too_wide", f"the object is {width:.3f} m wide; {gripper.name} opens to {gripper.width_max:.3f} m")
-    grasps = (pose, flipped(pose)) if flip else (pose,)
-    (before, at, _), q = run.choose_way([(way @ Pose((0.0, 0.0, -approach)), way, above(way, lift)) for way in grasps])
+    grasps = (pose, flip_pose(pose)) if flip else (pose,)
+    (before, at, _), q = run.choose_way([(to @ Pose((0.0, 0.0, -approach)), to, lift_pose(to, lift)) for to in grasps])
     return before, at, q
 
 
@@ -214,11 +214,11 @@ def touch(run: SkillRun, force: float, speed: float) -> float:
     """Close the fingers until one touches something; return the width there, m. Fail as ``missed`` if none does."""
     gripper = run.gripper
 
-    def pressed() -> bool:
+    def is_pressed() -> bool:
         now = gripper.state().force
         return now is not None and now >= _TOUCHED * force
 
-    run.close_fingers(lambda: gripper.start(0.0, min(speed, gripper.spec.speed), force), pressed)
+    run.close_fingers(lambda: gripper.start(0.0, min(speed, gripper.spec.speed), force), is_pressed)
     width = gripper.state().width
     if width <= gripper.width_min + NOTHING:
         run.fail("missed", f"{gripper.name} closed on nothing")
@@ -253,7 +253,7 @@ def lift_up(run: SkillRun, lift: float, hold: float) -> None:
     arm, gripper = run.arm, run.gripper
     held = gripper.state().width
     run.begin("lift")
-    run.move(above(arm.state().tcp_set, lift))
+    run.move(lift_pose(arm.state().tcp_set, lift))
     check_held(run, held)
     run.begin("hold")
     arm.clock.sleep(min(hold, run.time_left()))

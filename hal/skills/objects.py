@@ -84,12 +84,12 @@ def object_from_points(points: Array, table: float | None = None, name: str = ""
         raise CommandError(f"points must have shape (k, 3) with k of at least 8, not {points.shape}")
     if table is None:
         table = float(points[:, 2].min())
-    yaw = _narrowest(points[:, :2])
+    yaw = _find_narrowest(points[:, :2])
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     along = points[:, :2] @ turn.T
     lower, upper = np.percentile(along, [_TRIM, 100.0 - _TRIM], axis=0)
     inside = ((along >= lower) & (along <= upper)).all(axis=1)
-    widest, across = _widest(along[inside], lower[0], upper[0])
+    widest, across = _find_widest(along[inside], lower[0], upper[0])
     middle = np.array([0.5 * (lower[0] + upper[0]), across])
     top = float(np.percentile(points[:, 2], 100.0 - _TRIM))
     length, width = upper - lower
@@ -102,7 +102,7 @@ def object_from_points(points: Array, table: float | None = None, name: str = ""
     )
 
 
-def _narrowest(points: Array) -> float:
+def _find_narrowest(points: Array) -> float:
     """Return the angle of the long side of the narrowest box around points (k, 2), rad.
 
     Of boxes that are as narrow, as those around a mug with its handle, it is that of the longest.
@@ -114,7 +114,7 @@ def _narrowest(points: Array) -> float:
     return float(yaws[np.argmax(np.where(width <= width.min() + _SAME, length, 0.0))])
 
 
-def _widest(points: Array, start: float, end: float) -> tuple[float, float]:
+def _find_widest(points: Array, start: float, end: float) -> tuple[float, float]:
     """Return where along x points (k, 2) are widest across, and the middle across there, m."""
     edges = np.linspace(start, end, max(2, int((end - start) / _SLICE)) + 1)
     number = np.clip(np.searchsorted(edges, points[:, 0]) - 1, 0, len(edges) - 2)

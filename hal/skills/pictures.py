@@ -55,23 +55,23 @@ def draw_plan(
     draw = ImageDraw.Draw(image)
     from_base = (arm.base.inverse() @ frame.T_world_camera).inverse()
 
-    def pixels(points: Array) -> list[tuple[float, float]]:
+    def project(points: Array) -> list[tuple[float, float]]:
         """Return where points (k, 3) of the base frame are in the picture; those behind the camera are left out."""
         seen = from_base.transform(points)
         seen = seen[seen[:, 2] > 0.01] @ frame.K.T
         return [(scale * (u / z + 0.5), scale * (v / z + 0.5)) for u, v, z in seen.tolist()]
 
-    for x, y in pixels(found.points[:: max(1, len(found.points) // 2000)]):
+    for x, y in project(found.points[:: max(1, len(found.points) // 2000)]):
         draw.point([(x, y)], _POINT)
     length, width, height = found.size
     for z in (0.0, height):
         corners = [(a * length, b * width, z) for a, b in ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))]
-        ring = pixels(found.pose.transform(corners))
+        ring = project(found.pose.transform(corners))
         draw.line([*ring, *ring[:1]], _BOX, 2)
-    draw.line(pixels(np.array([pose.position for pose in way])), _WAY, 3)
+    draw.line(project(np.array([pose.position for pose in way])), _WAY, 3)
     for pose in way:
-        draw.line(pixels(pose.transform([[0.0, -0.5 * opening, 0.0], [0.0, 0.5 * opening, 0.0]])), _FINGERS, 4)
-        for x, y in pixels(pose.position[None]):
+        draw.line(project(pose.transform([[0.0, -0.5 * opening, 0.0], [0.0, 0.5 * opening, 0.0]])), _FINGERS, 4)
+        for x, y in project(pose.position[None]):
             draw.ellipse([x - 4, y - 4, x + 4, y + 4], _WAY)
     return np.asarray(image)
 

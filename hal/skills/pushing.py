@@ -13,7 +13,7 @@ from ..arguments import number, vector, whole
 from ..errors import CommandError
 from ..geometry import Pose, tcp_pose
 from .objects import LocatedObject
-from .running import SkillOptions, SkillResult, SkillRun, above, flipped
+from .running import SkillOptions, SkillResult, SkillRun, flip_pose, lift_pose
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -36,6 +36,9 @@ _BEHIND = 0.02
 """Distance from the object at which the fingers come down, and to which they back off, m."""
 _LET_GO = 0.01
 """By how much the fingers open before they back off, m."""
+_TURN = 2.0
+"""Length of the way on which an object turns until a side lies against the fingers, as a multiple of the distance from
+its middle to its corner behind."""
 _SAME_PLACE = 1e-3
 """Distance below which an object needs no push, m."""
 
@@ -78,9 +81,9 @@ def push(
     number("approach", approach, "m", least=0.0)
     run = SkillRun("push", arm, PHASES, **options)
     with run:
-        ways = [poses, [flipped(pose) for pose in poses]] if flip else [poses]
+        ways = [poses, [flip_pose(pose) for pose in poses]] if flip else [poses]
         heights = (approach, 0.6 * approach)  # lower where the arm does not reach that high
-        way, q = run.choose_way(*([_whole_way(each, height) for each in ways] for height in heights))
+        way, q = run.choose_way(*([_list_poses(each, height) for each in ways] for height in heights))
         start, *rest, away, end = way
         run.begin("close")
         if arm.gripper is not None:
@@ -98,13 +101,13 @@ def push(
     return run.result()
 
 
-def _whole_way(path: Sequence[Pose], approach: float) -> list[Pose]:
+def _list_poses(path: Sequence[Pose], approach: float) -> list[Pose]:
     """Return all poses that a push visits: above its start, along its path, back from its end, and up."""
     last, step = path[-1], path[-1].position - path[-2].position
     length = float(np.linalg.norm(step))
     back = step * (min(1.0, _BEHIND / length) if length > 0.0 else 0.0)
     away = Pose(last.position - back, last.orientation)
-    return [above(path[0], approach), *path, away, above(away, approach)]
+    return [lift_pose(path[0], approach), *path, away, lift_pose(away, approach)]
 
 
 def push_path(
@@ -114,7 +117,7 @@ def push_path(
 
     The tcp's z axis points down and its fingers close across the way, so that both touch the object; if the palm would
     touch it first, the hand leans back. The side of the box around the object that faces the fingers most is taken to
-    come to lie against them.
+    come to lie against them, but the shorter the way, the less the object turns on it.
 
     Args:
         found: The object.
@@ -135,15 +138,16 @@ def push_path(
     axes = found.pose.matrix()[:2, :2]
     side = 0.5 * found.size[int(np.argmax(np.abs(way @ axes)))]
     behind = float(np.max((middle - found.points[:, :2]) @ way))
+    side += (behind - side) * max(0.0, 1.0 - length / (_TURN * behind))
     z = found.table + max(clearance, min(height, 0.4 * found.height))
     yaw = math.atan2(way[1], way[0])
     tilt = _lean(found.table + found.height - z, finger)
 
-    def at(distance: float) -> Pose:
+    def find_pose(distance: float) -> Pose:
         """Return the pose of the tcp at a distance along the way, m."""
         return Pose.from_rpy([*(middle + distance * way), z], (math.pi, -tilt, yaw))
 
-    return [at(-behind - finger - _BEHIND), at(max(length - side, -behind) - finger)]
+    return [find_pose(-behind - finger - _BEHIND), find_pose(max(length - side, -behind) - finger)]
 
 
 def _lean(height: float, finger: float) -> float:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..gripper import Gripper, GripperMotion, GripperResult
     from ..robot import Robot
 
-__all__ = ["Reason", "SkillOptions", "SkillPhase", "SkillProgress", "SkillResult", "SkillRun", "above", "flipped"]
+__all__ = ["Reason", "SkillOptions", "SkillPhase", "SkillProgress", "SkillResult", "SkillRun", "flip_pose", "lift_pose"]
 
 Array = NDArray[np.float64]
 
@@ -281,7 +281,7 @@ class SkillRun:
 
         planner = PathPlanner(self.arm.kinematics, self.arm.limits.lower, self.arm.limits.upper)
         try:
-            planner.along_poses(q.tolist(), [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in way])
+            planner.plan_poses(q.tolist(), [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in way])
         except (Unreachable, CommandError):
             return False
         return True
@@ -335,7 +335,7 @@ class SkillRun:
             return
         middle = 0.5 * (start.tcp_set.position + pose.position)
         try:
-            over = arm.ik(above(Pose(middle, pose.orientation), _RAISE), q)
+            over = arm.ik(lift_pose(Pose(middle, pose.orientation), _RAISE), q)
         except Unreachable:
             over = q
         self._move(pose, np.array([over, q]))
@@ -443,7 +443,7 @@ class SkillRun:
                     self.time_left()
                     clock.sleep(max(_POLL, gripper.period))
                 else:
-                    return self._checked(motion.wait())
+                    return self._check_result(motion.wait())
             except BaseException:
                 if not motion.done:
                     gripper.stop()
@@ -457,7 +457,7 @@ class SkillRun:
         if result is not None and abs(result.state.width - goal) > 0.005:
             self.fail("fingers_blocked", f"{gripper.name} rests at {result.state.width:.4f} m instead of {goal:.4f} m")
 
-    def _checked(self, result: GripperResult) -> GripperResult:
+    def _check_result(self, result: GripperResult) -> GripperResult:
         """Return the result of a motion of the fingers; raise if it failed, or was ended by another command."""
         if result.outcome is GripperOutcome.FAILED:
             fault = result.fault
@@ -467,12 +467,12 @@ class SkillRun:
         return result
 
 
-def above(pose: Pose, height: float) -> Pose:
+def lift_pose(pose: Pose, height: float) -> Pose:
     """Return the pose ``height`` m farther up, along the z axis of the base frame."""
     return Pose(pose.position + [0.0, 0.0, height], pose.orientation)
 
 
-def flipped(pose: Pose) -> Pose:
+def flip_pose(pose: Pose) -> Pose:
     """Return the pose turned by half a turn about the tcp's own z axis: the same grasp for two equal fingers."""
     return pose @ Pose.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, math.pi))
 

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 from app_kit import run_here
+from engines_kit import Engine
 
+from hal.apps import _physics
 from hal.apps.check import main as check
 from hal.apps.teleop import main as teleop
 
@@ -73,12 +75,36 @@ def test_json_has_every_finding() -> None:
     [
         (["--duration", "0"], "--duration must be above 0"),
         (["--config", "panda_tabel"], "did you mean 'panda_table'"),
+        (["--physics", "--config", "franka"], "--physics has rigs of its own"),
     ],
 )
 def test_a_persons_mistake_is_a_message_not_a_traceback(arguments: list[str], text: str) -> None:
     done = run_here(check, *arguments)
     assert done.returncode == 2
     assert text in done.stderr
+
+
+def test_the_physics_of_each_engine_agrees_with_theory_within_3_percent(engine: Engine) -> None:
+    done = run_here(check, "--physics", "--engine", engine.name, "--json")
+    report = json.loads(done.stdout)
+    assert report["engine"] == engine.name
+    assert [row for row in report["rows"] if not row["fit"] or abs(row["difference"]) > 0.03] == []
+    assert len(report["rows"]) == 27
+    assert (report["fit"], done.returncode) == (True, 0)
+
+
+def test_an_experiment_that_disagrees_with_theory_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [
+        _physics.Row("near", "m", -1.0, -1.02),
+        _physics.Row("far", "m", 2.0, 1.9),
+        _physics.Row("at", "m", 0, 1, 40),
+    ]
+    monkeypatch.setattr(_physics, "EXPERIMENTS", {"made_up": lambda engine: iter(rows)})
+    done = run_here(check, "--physics")
+    assert done.returncode == 2
+    shown = {line.split()[1]: line for line in done.stdout.splitlines() if line.startswith(("ok", "FAIL"))}
+    assert {name: line.split()[0] for name, line in shown.items()} == {"near": "ok", "far": "FAIL", "at": "ok"}
+    assert [line.split()[-2] for line in shown.values()] == ["+2.00", "-5.00", "+2.50"]
 
 
 def test_teleoperation_of_an_arm_that_is_not_there_ends_before_anything_is_opened() -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 from benchmark_kit import load_benchmark
 from engines_kit import Engine
 
+import hal
 from hal.config.data_files import list_data
 from hal.errors import ConfigError
 from hal.types import Trip
@@ -17,17 +21,44 @@ pytestmark = pytest.mark.slow
 ENTRIES = [entry for model in list_data("robots") for entry in robots.entries(model)]
 
 
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: "-".join(entry.values()))
-def test_a_model_drives_and_closes_its_gripper(engine: Engine, entry: dict[str, Any]) -> None:
+@contextmanager
+def installed() -> Iterator[None]:
+    """Skip the test if the package with the model's files is not installed."""
     try:
-        found = robots.run_model(entry, engine.name, poses=10, tour=0.1)
+        yield
     except ConfigError as error:
         if all(problem.code == "missing_package" for problem in error.problems):
             pytest.skip(error.problems[0].message)
         raise
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: "-".join(entry.values()))
+def test_a_model_drives_and_closes_its_gripper(engine: Engine, entry: dict[str, Any]) -> None:
+    with installed():
+        found = robots.run_model(entry, engine.name, poses=10, tour=0.1)
     assert found.found == 10
     assert found.position <= 1e-5
     assert found.trip is Trip.NONE
     assert found.lag < 0.01
     if found.widths is not None:
         assert found.widths[1] < 2e-3 < 0.02 < found.widths[0]
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: "-".join(entry.values()))
+def test_a_model_without_torques_stays_where_a_reset_put_it(engine: Engine, entry: dict[str, Any]) -> None:
+    """From the first step on: what the motors left undone in it would be a speed of the arm."""
+    with installed(), hal.open({"robots": {"arm": entry}}, sim=True, clock="lock_step", engine=engine.name) as rig:
+        arm = rig.robots["arm"]
+        if arm.limits.torque is None:
+            pytest.skip("takes no torques")
+        rng, room = np.random.default_rng(2), 0.05
+        for _ in range(3):
+            q = arm.home + rng.uniform(-0.3, 0.3, arm.n)
+            rig.world.reset("arm", q=np.clip(q, np.add(arm.limits.lower, room), np.subtract(arm.limits.upper, room)))
+            start = arm.state().q
+            with arm.control(rate_hz=50) as control:
+                for tick in rig.clock.rate(50):
+                    control.send(hal.JointTorque([0.0] * arm.n))
+                    if tick.elapsed >= 2.0:
+                        break
+            assert np.abs(arm.state().q - start).max() < 2e-3

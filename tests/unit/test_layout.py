@@ -1,4 +1,4 @@
-"""The rules for the layout of the code: who may import whom, no circles, no driver named in ``hal/``, unique names."""
+"""The rules for the layout of the code: who may import whom, no circles, small functions, unique names."""
 
 from __future__ import annotations
 
@@ -10,7 +10,23 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-LARGEST_FILE = 600
+MOST_BRANCHES, MOST_LINES = 15, 60
+"""Of one function."""
+TANGLED = {
+    "hal/ark/arm_model.py:_joints",
+    "hal/ark/importing.py:import_ark",
+    "hal/ark/robots.py:place",
+    "hal/ark/scene.py:attached",
+    "hal/kinematics/collision_model.py:_scene",
+    "hal/recording/checking.py:_features",
+    "hal/recording/checking.py:check_index",
+    "hal/recording/exporters/__init__.py:export",
+    "hal/recording/finish.py:_prepare",
+    "hal/recording/merging.py:merge",
+    "hal/recording/recorder.py:__init__",
+    "hal/recording/sampling.py:select_devices",
+}
+"""Functions that are still above these limits. None is added; one that is divided is removed here."""
 CIRCLES = 3
 """At most so many import circles, TYPE_CHECKING included, and none of more modules than this."""
 SHARED_CLASS_NAMES = 3
@@ -110,7 +126,7 @@ def test_hal_names_no_driver() -> None:
         f"{module}: {found[0]}"
         for module, path in sources().items()
         if not module.startswith(("hal.drivers", "hal.apps", "hal.testing"))
-        and module not in {"hal.registry", *libraries}
+        and module not in {"hal.registry", "hal.pytest_plugin", *libraries}
         for found in quoted.finditer(texts.sub("", path.read_text(encoding="utf-8")))
     }
     assert not wrong
@@ -187,9 +203,36 @@ def test_no_docstring_is_a_question() -> None:
     assert not wrong
 
 
-def test_no_file_is_too_long() -> None:
-    long = {module: n for module, path in sources().items() if (n := len(path.read_text().splitlines())) > LARGEST_FILE}
-    assert not long
+def branches(function: ast.AST) -> int:
+    """Return the number of decisions in a function, functions in it included.
+
+    They are: if, for, while, except, case, a ternary, each ``and`` and ``or``, each condition of a comprehension.
+    """
+    decisions = (ast.If, ast.For, ast.While, ast.ExceptHandler, ast.IfExp, ast.match_case)
+    count = 0
+    for node in ast.walk(function):
+        if isinstance(node, ast.BoolOp):
+            count += len(node.values) - 1
+        elif isinstance(node, ast.comprehension):
+            count += len(node.ifs)
+        else:
+            count += isinstance(node, decisions)
+    return count
+
+
+def function_sizes() -> Iterator[tuple[str, int, int]]:
+    """Yield name, branches and lines of every function outside tests and benchmarks."""
+    beside = (path for folder in ("docs", "examples", "packages") for path in (ROOT / folder).rglob("*.py"))
+    for path in (*sources().values(), *(path for path in beside if "tests" not in path.parts)):
+        for node in ast.walk(tree(path)):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                lines = (node.end_lineno or node.lineno) - node.lineno + 1
+                yield f"{path.relative_to(ROOT)}:{node.name}", branches(node), lines
+
+
+def test_no_function_is_long_or_tangled() -> None:
+    found = {size for size in function_sizes() if size[1] > MOST_BRANCHES or size[2] > MOST_LINES}
+    assert {name for name, _, _ in found} <= TANGLED, found
 
 
 def import_table() -> dict[str, tuple[list[str], set[str]]]:

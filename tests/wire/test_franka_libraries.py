@@ -88,7 +88,7 @@ def test_every_exception_becomes_its_fault(library: str) -> None:
         assert found[name]["raised"] is not None, name
         fault = Fault(*found[name]["fault"])
         assert (fault.code, found[name]["lost"]) == (a.code, a.lost), (name, found[name])
-        assert records.fault_of(*records.fault_values(fault)) == fault, "it fits into a state"
+        assert records.make_fault(*records.fault_values(fault)) == fault, "it fits into a state"
     assert flags_in(found["all flags"]["text"]) == FLAGS, "in the order of the packets"
 
 

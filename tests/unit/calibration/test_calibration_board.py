@@ -22,7 +22,7 @@ OBJECT = data_folder("config") / "objects" / "charuco_board"
 
 
 def test_corners_are_numbered_as_opencv_does() -> None:
-    assert np.allclose(BOARD.corners, BOARD.for_opencv().getChessboardCorners(), atol=1e-7)
+    assert np.allclose(BOARD.corners, BOARD.make_opencv().getChessboardCorners(), atol=1e-7)
 
 
 def test_the_simulated_board_matches_its_file() -> None:
@@ -56,12 +56,12 @@ def test_the_board_is_detected_on_the_printed_page() -> None:
 
 
 def test_a_measured_square_scales_everything() -> None:
-    measured = BOARD.measured(0.0348)
+    measured = BOARD.resize(0.0348)
     assert measured.square == 0.0348
     assert measured.marker / measured.square == pytest.approx(BOARD.marker / BOARD.square)
     assert np.allclose(measured.corners, BOARD.corners * 0.0348 / 0.035)
     with raises_code(CommandError, "bad_square"):
-        BOARD.measured(34.8)
+        BOARD.resize(34.8)
 
 
 def test_a_board_from_a_file(tmp_path: Path) -> None:

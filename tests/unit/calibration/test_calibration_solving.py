@@ -103,7 +103,7 @@ def test_outlying_corners_have_little_weight() -> None:
 
 @pytest.mark.parametrize("share", [1.02, 0.98])
 def test_a_board_of_another_size_gives_a_warning(share: float) -> None:
-    found = solve(views("in-hand", poses(14), noise_px=0.1, real_board=BOARD.measured(share * 0.035)), "in-hand")
+    found = solve(views("in-hand", poses(14), noise_px=0.1, real_board=BOARD.resize(share * 0.035)), "in-hand")
     assert found.uncertainty.scale == pytest.approx(share - 1.0, abs=1e-3)
     assert (len(found.warnings), found.doubts) == (1, found.warnings)
 
@@ -113,7 +113,7 @@ def test_a_board_of_another_size_gives_a_warning(share: float) -> None:
 def test_a_K_or_a_board_wrong_by_a_tenth_is_refused(eye: Eye, share: float) -> None:
     wrong = K * [[share], [share], [1.0]]
     assert refused(views(eye, poses(15, 3), noise_px=0.2, arm=2e-4, believed=wrong), eye) == "wrong_size"
-    board = BOARD.measured(share * 0.035)
+    board = BOARD.resize(share * 0.035)
     assert refused(views(eye, poses(15, 3), noise_px=0.2, real_board=board), eye) == "wrong_size"
 
 

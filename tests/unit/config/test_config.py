@@ -139,6 +139,17 @@ def test_without_simulated_devices_there_is_no_world() -> None:
     assert plan(config).world is not None
 
 
+def test_objects_alone_are_in_a_world_of_a_simulated_rig() -> None:
+    objects = {"objects": ["floor", "cube"]}
+    for engine in ("pybullet", "mujoco"):
+        world = plan(objects, engine=engine).world
+        assert world is not None
+        assert (world.driver, [body.name for body in world.bodies]) == (engine, ["floor", "cube"])
+    assert plan(objects, sim=False).world is None
+    assert plan(objects, driver="mock").world is None
+    assert plan({"gamepads": {"pad": {}}}).world is None
+
+
 def test_only_the_chosen_kind_of_options_reaches_the_driver() -> None:
     robot = {"model": "panda", "real": {"host": "1.2.3.4"}, "simulated": {"lag": 0.01}, "drivers": MINE}
     robot["gripper"] = {"drivers": MINE}
@@ -316,10 +327,24 @@ def test_pads() -> None:
     assert named.dead_zone == 0.1
 
 
-def test_playback_files_are_relative_to_the_rig(tmp_path: Path) -> None:
+@pytest.mark.parametrize("chosen", ["driver: playback", "sim: true", "sim: true, driver: playback"])
+def test_a_recording_is_relative_to_the_rig(tmp_path: Path, chosen: str) -> None:
     shutil.copy(find_data("config", "teleop/tour.jsonl"), tmp_path)
-    (tmp_path / "rig.yaml").write_text("gamepads: {pad: {driver: playback, file: tour.jsonl}}")
-    assert plan(tmp_path / "rig.yaml").pads[0].options == {"file": str(tmp_path / "tour.jsonl")}
+    (tmp_path / "rig.yaml").write_text(f"gamepads: {{pad: {{{chosen}, file: tour.jsonl}}}}")
+    (pad,) = plan(tmp_path / "rig.yaml").pads
+    assert (pad.driver, pad.options) == ("playback", {"file": str(tmp_path / "tour.jsonl")})
+
+
+@pytest.mark.parametrize("sim", [None, True, False])
+def test_only_its_own_flag_makes_a_pad_simulated_or_real(sim: bool | None) -> None:
+    def pad(**keys: Any) -> tuple[str, bool]:
+        (found,) = plan({"gamepads": {"pad": keys}}, sim=sim).pads
+        return found.driver, found.real
+
+    assert pad() == ("auto", False)
+    assert pad(sim=True) == pad(sim=True, driver="mock") == ("mock", False)
+    assert pad(sim=False) == ("auto", True)
+    assert pad(sim=False, driver="evdev") == ("evdev", True)
 
 
 # Cameras.

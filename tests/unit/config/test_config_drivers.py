@@ -15,7 +15,7 @@ from errors_kit import raises_problems
 from hal.config import load
 from hal.config.data_files import find_data
 from hal.errors import ConfigError, DriverMissing
-from hal.host.hosts import groups_of
+from hal.host.hosts import make_groups
 from hal.specs import PayloadSpec, RobotSpec, from_json, to_json
 
 LAB = """
@@ -219,10 +219,10 @@ def two_on_a_bus(*adapters: str | None, **second: Any) -> dict[str, Any]:
     ],
 )
 def test_arms_on_one_adapter_share_a_process(adapters: tuple[str | None, ...], groups: list[str]) -> None:
-    found = groups_of(load(two_on_a_bus(*adapters)).resolve())
+    found = make_groups(load(two_on_a_bus(*adapters)).resolve())
     assert [group.name for group in found] == groups
     assert [robot.name for group in found for robot in group.robots] == ["left", "right"]
-    (simulated,) = groups_of(load(two_on_a_bus(*adapters), sim=True).resolve())
+    (simulated,) = make_groups(load(two_on_a_bus(*adapters), sim=True).resolve())
     assert simulated.name == "simulation"
 
 
@@ -230,7 +230,7 @@ def test_arms_that_share_a_process_have_one_rate() -> None:
     with pytest.raises(ConfigError) as caught:
         load(two_on_a_bus("usb0", "usb0", rate_hz=200))
     assert [(p.key, p.code) for p in caught.value.problems] == [("robots.right.rate_hz", "unequal_rates")]
-    assert len(groups_of(load(two_on_a_bus("usb0", "usb1", rate_hz=200)).resolve())) == 2
+    assert len(make_groups(load(two_on_a_bus("usb0", "usb1", rate_hz=200)).resolve())) == 2
 
 
 def test_a_payload_is_for_arms_whose_driver_carries_it() -> None:

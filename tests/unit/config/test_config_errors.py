@@ -206,6 +206,12 @@ def thing(**keys: Any) -> dict[str, Any]:
         ({"gamepads": {"p": {"driver": "playback", "file": "no.jsonl"}}}, "gamepads.p.file", "missing_file"),
         ({"gamepads": {"p": {"driver": "keyboard"}}}, "gamepads.p.driver", "unknown_driver"),
         ({"gamepads": {"p": {"file": "a.jsonl"}}}, "gamepads.p.file", "conflict"),
+        ({"gamepads": {"p": {"sim": True, "driver": "evdev"}}}, "gamepads.p.sim", "conflict"),
+        ({"gamepads": {"p": {"sim": False, "driver": "mock"}}}, "gamepads.p.sim", "conflict"),
+        ({"gamepads": {"p": {"sim": False, "file": "a.jsonl"}}}, "gamepads.p.file", "conflict"),
+        ({"gamepads": {"p": {"sim": True, "file": "no.jsonl"}}}, "gamepads.p.file", "missing_file"),
+        ({"gamepads": {"p": {"sim": True, "options": {"loop": True}}}}, "gamepads.p.options", "conflict"),
+        ({"gamepads": {"p": {"sim": "maybe"}}}, "gamepads.p.sim", "wrong_type"),
         # Names of devices.
         ({"robots": {"a": ROBOT}, "cameras": {"a": CAMERA}}, "cameras.a", "duplicate_name"),
     ],

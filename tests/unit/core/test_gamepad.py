@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from errors_kit import raises_code
 
+import hal
 from hal.driver import GamepadDriver, PadReading
 from hal.errors import DeviceNotFound, NotSupported
 from hal.gamepad import Gamepad
@@ -364,3 +365,17 @@ def test_controls_are_named_as_printed_on_the_pad(
     assert [pad.control_name(name) for name in ("l2", "dpad_x", "south")] == ["L2", "D-pad left/right", "south"]
     monkeypatch.setattr(Played, "control_names", {"l2": "LT", "south": "A"})
     assert [pad.control_name(name) for name in ("l2", "r2", "south")] == ["LT", "R2", "A"]
+
+
+@pytest.mark.parametrize("clock", ["real_time", "lock_step"])
+def test_a_program_operates_the_simulated_pad_of_a_rig(clock: str) -> None:
+    with hal.open({"gamepads": {"pad": {"sim": True}}}, clock=clock) as rig:
+        pad, simulated = rig.gamepads["pad"], rig.driver("pad")
+        simulated.press("l2")
+        if clock == "lock_step":
+            rig.clock.sleep(0.1)
+        else:
+            pad.wait(5.0)
+        assert pad.state().axes["l2"] == 1.0
+        assert pad.hold("l2")
+        assert "no person holds it" in str(pad.distrust())

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hal.config import load
-from hal.host.hosts import GRIPPER_HZ, groups_of
+from hal.host.hosts import GRIPPER_HZ, make_groups
 from hal.specs import GroupSpec, from_json, to_json
 
 
@@ -24,7 +24,7 @@ def apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def groups(overrides: list[str], clock: str, driver: str | None = None) -> list[GroupSpec]:
-    return groups_of(load("panda_table", sim=True, driver=driver, clock=clock, overrides=overrides).resolve())
+    return make_groups(load("panda_table", sim=True, driver=driver, clock=clock, overrides=overrides).resolve())
 
 
 @pytest.mark.parametrize("clock", ["real_time", "lock_step"])

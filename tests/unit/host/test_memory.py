@@ -110,14 +110,14 @@ def ring(slots: int) -> tuple[Mailbox, History[Sample]]:
 
 def test_the_last_states_stay_and_older_ones_go() -> None:
     box, history = ring(8)
-    assert history.since(0.0) == []
-    assert history.around(0.0) is None
+    assert history.read_since(0.0) == []
+    assert history.find_around(0.0) is None
     for k in range(1, 101):
         box.write(float(k), 2.0 * k)
-        found = [sample.stamp.t for sample in history.since(0.0)]
+        found = [sample.stamp.t for sample in history.read_since(0.0)]
         assert found == [float(j) for j in range(max(1, k - 6), k + 1)], "all but the one that is written over next"
-    assert [sample.value for sample in history.since(97.5)] == [196.0, 198.0, 200.0]
-    assert history.since(100.0) == []
+    assert [sample.value for sample in history.read_since(97.5)] == [196.0, 198.0, 200.0]
+    assert history.read_since(100.0) == []
     assert box.read() == (100, (100.0, 200.0)), "the newest one as ever"
 
 
@@ -126,9 +126,9 @@ def test_neighbours_of_a_time() -> None:
     for k in range(1, 21):
         box.write(float(k), 0.0)
     for t, expected in ((17.5, (17.0, 18.0)), (17.0, (17.0, 18.0)), (20.0, (20.0, 20.0)), (25.0, (20.0, 20.0))):
-        found = history.around(t)
+        found = history.find_around(t)
         assert (found[0].stamp.t, found[1].stamp.t) == expected
-    assert history.around(5.0) is None, "too old"
+    assert history.find_around(5.0) is None, "too old"
 
 
 def test_the_number_of_slots_is_a_power_of_two() -> None:
@@ -144,7 +144,7 @@ def test_a_reader_never_sees_a_torn_state_while_the_writer_laps_it() -> None:
 
     def read() -> None:
         while not done.is_set():
-            found = history.since(0.0)
+            found = history.read_since(0.0)
             if any(sample.value != 2.0 * sample.stamp.t for sample in found):
                 trouble.append("torn")
             if any(a.stamp.t >= b.stamp.t for a, b in itertools.pairwise(found)):

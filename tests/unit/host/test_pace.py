@@ -50,7 +50,7 @@ def test_steps_wait_for_the_app_and_go_as_far_as_it_says() -> None:
 def test_steps_tell_the_app_is_there_at_the_time_of_the_step() -> None:
     cycle = FakeCycle(ticks=9)
     steps = StepPace(cycle, lambda timeout: None)
-    assert steps.heard(AppRecord(12345.0, 3)) == AppRecord(pytest.approx(0.1), 3)
+    assert steps.adjust_heartbeat(AppRecord(12345.0, 3)) == AppRecord(pytest.approx(0.1), 3)
     assert steps.now() == pytest.approx(0.09)
 
 
@@ -87,16 +87,16 @@ def test_a_suspension_is_noticed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "CLOCK_BOOTTIME", 7, raising=False)
     monkeypatch.setattr(time, "clock_gettime", lambda clock: time.monotonic() + asleep[0])
     suspension = SuspensionWatch()
-    assert not suspension.ended()
+    assert not suspension.was_suspended()
     asleep[0] += 60.0
-    assert suspension.ended()
-    assert not suspension.ended()
+    assert suspension.was_suspended()
+    assert not suspension.was_suspended()
 
 
 def test_where_the_system_cannot_say_nothing_was_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(time, "CLOCK_BOOTTIME", raising=False)
     suspension = SuspensionWatch()
-    assert not suspension.ended()
+    assert not suspension.was_suspended()
 
 
 PERIOD = 0.004

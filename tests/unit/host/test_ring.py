@@ -198,7 +198,7 @@ def test_a_copy_during_which_the_writer_overtakes_is_thrown_away(first: int, fin
 
 def test_slots_are_used_in_place_and_in_turn() -> None:
     arrays = {"row": ((3,), np.float64), (0, "color"): ((2, 2), np.uint8)}
-    memory = memoryview(bytearray(ArrayRing.bytes_of(arrays, 2)))
+    memory = memoryview(bytearray(ArrayRing.count_bytes(arrays, 2)))
     writer, reader = ArrayRing(memory, arrays, 2), ArrayRing(memory, arrays, 2)
     assert reader.oldest() is None
     for value in (1, 2):

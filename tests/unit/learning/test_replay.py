@@ -11,7 +11,7 @@ import pytest
 from errors_kit import raises_code
 
 import hal
-from hal.learning.replay import Deviation, RecordedTrajectory, TrajectoryPlayer, other_moving_arms, recorded_arms
+from hal.learning.replay import Deviation, RecordedTrajectory, TrajectoryPlayer, list_other_arms, list_recorded_arms
 
 FPS = 30
 BARE = ["cameras={}"]
@@ -268,10 +268,10 @@ def test_one_arm_of_two_is_found_by_its_name(episode: Recorded) -> None:
         assert trajectory.joints == single.joints
         for name in ("t", "q_set", "q", "tcp", "grip"):
             assert getattr(trajectory, name) == pytest.approx(getattr(single, name))
-        assert recorded_arms(two) == ["left", "panda"]  # type: ignore[arg-type]
-        assert other_moving_arms(two, "panda") == [], "the other one stood still"  # type: ignore[arg-type]
-        assert other_moving_arms(two, "left") == ["panda"]  # type: ignore[arg-type]
-        assert other_moving_arms(episode, "left") == [], "there is no other"  # type: ignore[arg-type]
+        assert list_recorded_arms(two) == ["left", "panda"]  # type: ignore[arg-type]
+        assert list_other_arms(two, "panda") == [], "the other one stood still"  # type: ignore[arg-type]
+        assert list_other_arms(two, "left") == ["panda"]  # type: ignore[arg-type]
+        assert list_other_arms(episode, "left") == [], "there is no other"  # type: ignore[arg-type]
         arm.name = "right"
         with raises_code(hal.CommandError, "no_such_arm"):
             course_of(two, arm)

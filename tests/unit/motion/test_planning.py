@@ -57,7 +57,7 @@ def test_a_rotation_on_the_spot_and_poses_that_repeat() -> None:
 
 def test_the_spline_is_on_the_way_everywhere() -> None:
     poses = [moved([0.1, 0.0, -0.1]), moved([0.1, 0.2, 0.0], (0.0, 0.3, 0.4)), moved([-0.1, 0.2, 0.0])]
-    plan = planner().along_poses(PANDA_HOME, poses, 0.02)
+    plan = planner().plan_poses(PANDA_HOME, poses, 0.02)
     (line,) = tcp_lines([START, *poses], 0.02)
     path = JointPath(plan.sections[0])
     for s in np.linspace(0.0, line.length, 1000).tolist():
@@ -77,7 +77,7 @@ def test_the_spline_is_on_the_way_everywhere() -> None:
 def test_refusals_say_how_far_along(goal: list[float], code: str) -> None:
     box = WorkspaceSpec((-1.0, -0.2, 0.0), (1.5, 0.2, 1.5))
     with pytest.raises(Unreachable) as caught:
-        planner(workspace=box).along_poses(PANDA_HOME, [goal])
+        planner(workspace=box).plan_poses(PANDA_HOME, [goal])
     found = caught.value
     assert found.code == code
     assert 0.0 < found.along < 1.0
@@ -87,21 +87,21 @@ def test_refusals_say_how_far_along(goal: list[float], code: str) -> None:
     if code == "workspace":
         assert found.along == pytest.approx(0.2 / 0.3, abs=0.03)
     short = line.at(0.98 * found.distance - 0.005)  # up to there it can be followed
-    assert planner(workspace=box).along_poses(PANDA_HOME, [short]).sections
+    assert planner(workspace=box).plan_poses(PANDA_HOME, [short]).sections
 
 
 def test_a_start_outside_may_come_back_in() -> None:
     box = WorkspaceSpec((-1.0, -1.0, 0.6), (1.0, 1.0, 1.5))
-    assert planner(workspace=box).along_poses(PANDA_HOME, [moved([0.0, 0.0, 0.2])]).sections
+    assert planner(workspace=box).plan_poses(PANDA_HOME, [moved([0.0, 0.0, 0.2])]).sections
     with raises_code(Unreachable, "outside_workspace"):
-        planner(workspace=box).along_poses(PANDA_HOME, [moved([0.0, 0.0, -0.1])])
+        planner(workspace=box).plan_poses(PANDA_HOME, [moved([0.0, 0.0, -0.1])])
 
 
 def test_waypoints_are_passed_exactly_or_rounded() -> None:
     points = [np.add(PANDA_HOME, d) for d in ([0.3] * 7, [0.3, 0.6, 0, 0, 0, 0, 0], [0.3, 0.9, -0.3, 0, 0, 0, 0])]
-    exact = planner().along_joints(PANDA_HOME, points)
+    exact = planner().plan_joints(PANDA_HOME, points)
     assert [section.q[-1] for section in exact.sections] == [tuple(point.tolist()) for point in points]
-    (section,) = planner().along_joints(PANDA_HOME, points, 0.1).sections
+    (section,) = planner().plan_joints(PANDA_HOME, points, 0.1).sections
     samples = JointPath(section).samples(4)
     for point in points[:-1]:
         assert 0.005 < np.linalg.norm(samples - point, axis=1).min() < 0.04
@@ -122,7 +122,7 @@ def test_a_further_check_gets_the_whole_way() -> None:
         raise CommandError("no", code="refused_here")
 
     with raises_code(CommandError, "refused_here"):
-        planner(check=check).along_poses(PANDA_HOME, [moved([0.1, 0.1, 0.0])])
+        planner(check=check).plan_poses(PANDA_HOME, [moved([0.1, 0.1, 0.0])])
     assert seen[0][0] == pytest.approx(PANDA_HOME)
     assert np.abs(np.diff(seen[0], axis=0)).max() < 0.05
 
@@ -130,5 +130,5 @@ def test_a_further_check_gets_the_whole_way() -> None:
 def test_a_way_of_too_many_knots_is_refused() -> None:
     poses = [moved([0.05 * (-1) ** k, 0.001 * k, 0.0]) for k in range(120)]
     with raises_code(CommandError, "path_too_long"):
-        planner().along_poses(PANDA_HOME, poses, 0.0)
+        planner().plan_poses(PANDA_HOME, poses, 0.0)
     assert isinstance(hal.Unreachable, type)

@@ -1,8 +1,10 @@
 """Which pad drives: a plugged-in one, the console, or a recording."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from errors_kit import raises_code
 
 from hal.driver import Plugged
 from hal.errors import DeviceNotFound, NotSupported
@@ -86,6 +88,18 @@ def test_what_was_asked_for(plug, tmp_path: Path) -> None:
     assert Path(choose("demo").spec.options["file"]).name == "tour.jsonl"
     with pytest.raises(DeviceNotFound, match=r"there is no pad 'nothing': auto, evdev, web"):
         choose("nothing")
+
+
+def test_no_recording_takes_the_place_of_a_real_pad(plug) -> None:
+    real = replace(AUTO, real=True)
+    plug()
+    with raises_code(DeviceNotFound, "no_gamepad"):
+        choose(lock_step=True, spec=real)
+    with raises_code(NotSupported, "recording_of_real_pad"):
+        choose("demo", spec=real)
+    assert choose(spec=real).spec.driver == "web"
+    plug("DualShock 4")
+    assert choose(lock_step=True, spec=real).spec.driver == "evdev"
 
 
 def test_a_pad_that_may_come_later_is_told(plug) -> None:

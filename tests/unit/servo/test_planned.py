@@ -27,7 +27,7 @@ PLANNER = PathPlanner(ARM, SPEC.limits.lower, SPEC.limits.upper)
 START = ARM.fk(PANDA_HOME)
 WAY = np.array([0.1, 0.25, -0.2])
 GOAL = [*np.add(START[:3], WAY), *after_rotation(START[3:], (0.2, -0.1, 0.3))]
-PLAN = PLANNER.along_poses(PANDA_HOME, [GOAL])
+PLAN = PLANNER.plan_poses(PANDA_HOME, [GOAL])
 
 
 def bench_of(sections: tuple[PathSection, ...] = PLAN.sections, **terms) -> Bench:
@@ -115,7 +115,7 @@ BESIDE = [0.605, 0.094, 0.104, -0.4905, 0.7433, 0.3433, -0.2999]
 
 
 def test_a_line_near_a_singularity_takes_little_longer_than_the_least_time() -> None:
-    sections = PLANNER.along_poses(SINGULAR, [BESIDE]).sections
+    sections = PLANNER.plan_poses(SINGULAR, [BESIDE]).sections
     bench = bench_of(sections, spec=replace(SPEC, home=tuple(SINGULAR)))
     bench.begin()
     assert finish(bench) < 1.3 * 0.467  # optimal_time() of benchmarks/motion.py
@@ -128,12 +128,12 @@ def random_line(numbers: np.random.Generator) -> tuple[PathSection, ...]:
         q = numbers.uniform(SPEC.limits.lower, SPEC.limits.upper).tolist()
         start, way, turn = ARM.fk(q), numbers.normal(0.0, 0.07, 3), numbers.normal(0.0, 0.2, 3)
         with contextlib.suppress(Unreachable):
-            return PLANNER.along_poses(q, [[*np.add(start[:3], way), *after_rotation(start[3:], turn)]]).sections
+            return PLANNER.plan_poses(q, [[*np.add(start[:3], way), *after_rotation(start[3:], turn)]]).sections
 
 
 def test_limits_hold_along_any_line_with_pauses() -> None:
     numbers = np.random.default_rng(1)
-    lines = [PLANNER.along_poses(SINGULAR, [BESIDE]).sections, *(random_line(numbers) for _ in range(6))]
+    lines = [PLANNER.plan_poses(SINGULAR, [BESIDE]).sections, *(random_line(numbers) for _ in range(6))]
     for sections in lines:
         bench = bench_of(sections, spec=replace(SPEC, home=sections[0].q[0]), deadman=True)
         bench.press()
@@ -183,7 +183,7 @@ def test_a_motion_without_a_plan_ends(seconds: float, monkeypatch: pytest.Monkey
 
 def test_sections_follow_each_other_with_a_rest_in_between() -> None:
     middle = [x + 0.2 for x in PANDA_HOME]
-    plan = PLANNER.along_joints(PANDA_HOME, [middle, PANDA_HOME])
+    plan = PLANNER.plan_joints(PANDA_HOME, [middle, PANDA_HOME])
     assert len(plan.sections) == 2
     bench = bench_of(plan.sections, tcp_speed=1e9)
     bench.begin()

@@ -10,7 +10,7 @@ from errors_kit import raises_code
 
 import hal
 from hal.skills import find_by_depth, locate_by_depth, look_at
-from hal.skills.depth import find_table, largest_cluster, points_of
+from hal.skills.depth import collect_points, find_table, largest_cluster
 
 SLOPE = (0.05, -0.03, -0.1)
 
@@ -90,5 +90,5 @@ def test_what_a_camera_cannot_do_is_refused(rig: hal.Rig) -> None:
     with raises_code(hal.CommandError, "not_on_the_hand"):
         look_at(arm, fixed, [0.5, 0.0, 0.0])
     with raises_code(hal.NotSupported, "no_depth"):
-        points_of(arm, [fixed.read()])
+        collect_points(arm, [fixed.read()])
     assert look_at(arm, rig.cameras["wrist"], [3.0, 0.0, 0.0]).reason in ("unreachable", "outside_limits")

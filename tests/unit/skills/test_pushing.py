@@ -79,6 +79,17 @@ def test_the_way_is_behind_the_object_and_short_of_the_goal(angle: float) -> Non
     assert matrix[2, 2] == pytest.approx(-1.0), "and z down"
 
 
+def test_an_object_does_not_turn_on_a_short_way() -> None:
+    """Pushed at its corner, it lies against the fingers with its side only after a long way: else it goes too far."""
+    turned = math.radians(50.0)
+    found, way = block(0.5, 0.1, (0.06, 0.02, 0.03), turned), np.array([1.0, 0.0])
+    corner, side = 0.03 * math.cos(turned) + 0.01 * math.sin(turned), 0.01
+    for length, left in ((0.003, corner), (0.1, side)):
+        goal = [0.5, 0.1] + length * way
+        end = push_path(found, goal, finger=0.01)[-1]
+        assert goal[0] - end.position[0] == pytest.approx(left + 0.01, abs=2e-3)
+
+
 def test_the_hand_leans_back_from_tall_objects() -> None:
     leans = []
     for height in (0.03, 0.06, 0.12):

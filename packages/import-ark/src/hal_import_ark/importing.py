@@ -11,7 +11,7 @@ from typing import Any
 
 from hal.config import load
 from hal.config.data_files import list_data
-from hal.config.files import nearest
+from hal.config.files import suggest
 from hal.errors import CommandError, ConfigError, Problem
 
 from .arm_model import ArmModel
@@ -146,7 +146,7 @@ def _model_file(rig: Path, robot: str) -> Path:
 def _check_options(options: ArkOptions) -> None:
     models = list_data("sensors", "cameras")
     if options.camera_model not in models:
-        known = nearest(options.camera_model, models)
+        known = suggest(options.camera_model, models)
         raise CommandError(f"unknown camera model {options.camera_model!r}{known}", code="unknown_model")
     if options.start is not None and not options.start.is_dir():
         raise CommandError(f"--start {options.start}: there is no such folder", code="no_folder")
@@ -163,7 +163,7 @@ def _check_names(work: ImportState) -> None:
     for option, name, names in asked:
         if name not in names:
             raise CommandError(
-                f"{option} {name}: no such name in Ark's files{nearest(name, names)}", code="unknown_name"
+                f"{option} {name}: no such name in Ark's files{suggest(name, names)}", code="unknown_name"
             )
 
 

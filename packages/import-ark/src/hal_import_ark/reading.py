@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from hal.config.files import PlacedErrors, Problems, check_size, nearest
+from hal.config.files import PlacedErrors, Problems, check_size, suggest
 from hal.config.schema import describe, is_number
 from hal.errors import ConfigError
 from hal.kinematics.mesh_files import package_folder
@@ -122,7 +122,7 @@ class ArkReader:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
             siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
-            hint = nearest(path.name, siblings) if siblings else ""
+            hint = suggest(path.name, siblings) if siblings else ""
             self.problems.add(path, "", f"there is no such file{hint}", "missing_file")
             raise InvalidValue from None
         except (OSError, UnicodeDecodeError) as error:

@@ -8,7 +8,7 @@ from typing import Any
 
 from hal.config import load
 from hal.config.data_files import list_data
-from hal.config.files import nearest
+from hal.config.files import suggest
 from hal.geometry import Pose
 from hal.kinematics.urdf import read_urdf
 from hal.specs import GripperSpec, RobotSpec
@@ -241,7 +241,7 @@ def _model(
     if given in options.arms:
         model, there = options.arms[given], list_data("robots")
         if model not in there:
-            message = f"--arm {given}={model}: there is no such model{nearest(model, there)}"
+            message = f"--arm {given}={model}: there is no such model{suggest(model, there)}"
             raise reading.wrong(node, message, "unknown_model")
         return model, "from --arm"
     joints = set(urdf.model.joints) if urdf is not None else set()

@@ -20,7 +20,7 @@ from hal.host import records
 
 def fits(fault: Fault) -> bool:
     """Return whether a fault reaches a program unshortened."""
-    return records.fault_of(*records.fault_values(fault)) == fault
+    return records.make_fault(*records.fault_values(fault)) == fault
 
 
 def test_every_flag_has_its_own_cause_and_a_remedy() -> None:
