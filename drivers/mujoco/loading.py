@@ -238,7 +238,7 @@ def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: flo
     order = (urdf.root, *(joint.child for joint in urdf.outwards))
     number = {name: k for k, name in enumerate(order)}
     carried_by = {joint.child: joint for joint in urdf.joints.values()}
-    pads = pad_links(spec, urdf) if isinstance(spec, RobotSpec) else {}
+    pads = pad_links(spec, urdf)
     links: list[LinkPlan] = []
     fixed: list[str] = []
     problems: list[Problem] = []

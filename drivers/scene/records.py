@@ -137,13 +137,15 @@ def followers_of(spec: RobotSpec, urdf: UrdfModel) -> tuple[UrdfMimic, ...]:
     return tuple(one for one in mimics_of(spec, urdf) if one.of in fingers and one.joint not in driven)
 
 
-def pad_links(spec: RobotSpec, urdf: UrdfModel) -> dict[str, tuple[float, float] | None]:
+def pad_links(spec: BodySpec | RobotSpec, urdf: UrdfModel) -> dict[str, tuple[float, float] | None]:
     """Return the links that the gripper holds things with, and their lateral and spinning friction.
 
     They are its fingers; a single jaw closes on the link that carries it. The friction is that of rubber
     (:data:`PAD_FRICTION`); None where the file has a ``<contact>`` of its own.
     """
-    fingers = spec.gripper.joints if spec.gripper else ()
+    if not isinstance(spec, RobotSpec) or spec.gripper is None:
+        return {}
+    fingers = spec.gripper.joints
     moved = {*fingers, *(one.joint for one in followers_of(spec, urdf))}
     pads = {link for link in urdf.links if any(joint.name in moved for joint in urdf.above(link))}
     if len(moved) == 1:
