@@ -131,7 +131,7 @@ def loadable_urdf(path: str, tight: Mapping[str, Sequence[UrdfVisual]] | None = 
     """Yield the path of a URDF that PyBullet can load: a temporary copy where meshes are in packages.
 
     Visual shapes whose meshes are in a package that is not installed are left out. ``tight`` has the collision shapes
-    of links whose meshes get no margin: on a finger it would be an error of the width.
+    of links that get no margin: on a finger it would be an error of the width.
     """
     folder = Path(path).resolve().parent
     root = parse_xml(path)
@@ -154,8 +154,12 @@ def loadable_urdf(path: str, tight: Mapping[str, Sequence[UrdfVisual]] | None = 
 
 
 def _tighten(link: ElementTree.Element, shapes: Sequence[UrdfVisual], place: Path) -> None:
-    """Replace the meshes of a link's collision shapes by hulls without PyBullet's margin, in files at ``place``."""
+    """Take PyBullet's margin off a link's cylinders, and off its meshes, which become hulls in files at ``place``."""
     for collision, shape in zip(link.findall("collision"), shapes, strict=bool(shapes)):
+        for cylinder in collision.iter("cylinder"):  # in a URDF PyBullet makes a hull of it
+            radius, length = shape.size
+            margin = min(MARGIN, THIN * min(2.0 * radius, length))
+            cylinder.attrib = {"radius": f"{radius - margin:.9g}", "length": f"{length - 2.0 * margin:.9g}"}
         if shape.shape != "mesh":
             continue
         link.remove(collision)
@@ -189,7 +193,6 @@ def _load_urdf(
     with loadable_urdf(path, tight) as file, silenced() as captured:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
-            flags |= client.URDF_USE_IMPLICIT_CYLINDER  # else cylinders are hulls, and larger by MARGIN
             if not drawn:
                 flags |= client.URDF_IGNORE_VISUAL_SHAPES
             number = client.loadURDF(file, useFixedBase=fixed, globalScaling=scale, flags=flags)
