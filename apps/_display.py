@@ -72,7 +72,7 @@ def _missing_libraries(plan: Plan) -> dict[str, str]:
     from hal import registry
 
     devices = [device for robot in plan.robots for device in (robot, robot.gripper) if device is not None]
-    return {name: command for device in devices for name, command in registry.missing(device.driver, device).items()}
+    return {name: command for one in devices for name, command in registry.find_missing(one.driver, one).items()}
 
 
 def _pad(pad: PadSpec) -> str:
@@ -226,7 +226,7 @@ class TeleopDisplay:
         yield f"{arm.robot.name if named else 'dead-man'} {held:8s}"
         yield f"{state.status.name.lower():9s}"
         yield "tcp {:6.3f} {:6.3f} {:6.3f} m".format(*state.tcp.position)
-        fingers = gripper.newest() if gripper is not None else None
+        fingers = gripper.peek() if gripper is not None else None
         if fingers is not None and not arm.gripper_trouble:
             yield f"gripper {1e3 * fingers.width:4.0f} mm"
         if state.limited:

@@ -45,7 +45,7 @@ def show_cameras() -> bool:
             spec = registry.driver(name)
             if spec.camera is None or spec.world is not None:
                 continue
-            missing = registry.missing(name)
+            missing = registry.find_missing(name)
             if missing:
                 print(f"{name:12s} its library is not installed: {', '.join(missing.values())}")
                 continue
@@ -76,7 +76,7 @@ def show_can() -> bool:
         if (place := registry.driver(name).buses) is not None:
             drivers.setdefault(place, []).append(name)
     for place, names in drivers.items():
-        missing = registry.missing(names[0])
+        missing = registry.find_missing(names[0])
         if missing:
             print(f"the library of {' and '.join(names)} is not installed: {', '.join(missing.values())}")
             failed = True
@@ -416,7 +416,7 @@ def main(argv: list[str] | None = None) -> int:
 def _main(args: argparse.Namespace) -> int:
     from hal.config import load
     from hal.errors import CommandError
-    from hal.preflight import checked_cameras, preflight, real_arms
+    from hal.preflight import list_checked_cameras, list_real_arms, preflight
 
     if args.pads:
         return _pads(args)
@@ -436,7 +436,7 @@ def _main(args: argparse.Namespace) -> int:
         print(json.dumps({"rig": plan.source, "fit": _fit(found), "verdicts": [asdict(v) for v in found]}, indent=2))
     else:
         found = _shown(verdicts)
-        if not real_arms(plan) and not checked_cameras(plan):
+        if not list_real_arms(plan) and not list_checked_cameras(plan):
             print("no device checks for this rig; checked this computer only")
     return 0 if _fit(found) else ACTION_NEEDED
 
@@ -469,9 +469,9 @@ def may_open(plan: Plan) -> bool:
     Returns:
         Whether no check failed; True at once without a real arm.
     """
-    from hal.preflight import preflight, real_arms
+    from hal.preflight import list_real_arms, preflight
 
-    arms = real_arms(plan)
+    arms = list_real_arms(plan)
     emulated = all(robot.emulated for robot in arms)  # an emulator does not depend on this computer's timing
     return not arms or _fit(_shown(preflight(plan, _BRIEF_DURATION, machine=not emulated, cameras=False)))
 

@@ -132,10 +132,8 @@ def _main(args: argparse.Namespace) -> int:
     _check_plan(plan)
     if plan.engine is not None:
         registry.check_engine(plan.engine)
-    print(
-        "\n".join(f"  {line}" for line in [f"rig      {plan.source}", *list_devices(replace(plan, pads=())), *details]),
-        flush=True,
-    )
+    shown = (f"rig      {plan.source}", *list_devices(replace(plan, pads=())), *details)
+    print("\n".join(f"  {text}" for text in shown), flush=True)
     line = StatusLine()
     with ExitStack() as cluster:
         start_worker: StartWorker = LocalWorker

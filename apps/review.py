@@ -58,7 +58,9 @@ def parser() -> argparse.ArgumentParser:
         "--check", action="store_true", help="compare every file with the index: rows, images, depth, time stamps"
     )
     files.add_argument(
-        "--repair", action="store_true", help="finish interrupted episodes, and rebuild a lost index from the episodes"
+        "--repair",
+        action="store_true",
+        help="finish interrupted episodes, rebuild a lost index, and close grasps of earlier versions",
     )
     made.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
     made.add_argument("--force", action="store_true", help="overwrite an existing picture or .rrd file")

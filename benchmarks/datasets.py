@@ -1,9 +1,10 @@
 """Datasets of many episodes: how fast they open, are read at random, continued and curated, and what the index takes.
 
-    python benchmarks/datasets.py [--episodes 1000] [--frames 5000]
+    python benchmarks/datasets.py [--episodes 10000] [--frames 5000]
 
-A few short episodes of a mock rig with two small cameras are recorded, and merged with themselves. At most 1,024 files
-may be open. Every figure stands beside that of a dataset with a tenth of the episodes.
+A few short episodes of a mock rig with two small cameras are recorded, and merged with themselves, ten at a time. At
+most 1,024 files may be open. Every figure stands beside those of datasets with a tenth and a hundredth of the episodes,
+and random pictures beside PyAV by hand.
 """
 
 from __future__ import annotations
@@ -11,15 +12,18 @@ from __future__ import annotations
 import argparse
 import resource
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import hal
-from hal.recording import Dataset, Recorder, delete_episodes, mark_episodes, merge, pack
+from hal.recording import Dataset, Episode, Recorder, delete_episodes, mark_episodes, merge, pack
 
 FPS, SECONDS, RECORDED = 20, 1.0, 10
 CAMERAS = ("scene", "wrist")
@@ -48,59 +52,135 @@ def timed(action: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def random_frames(out: Path, count: int) -> None:
-    """Read pictures of random rows."""
+def random_rows(out: Path, count: int) -> Iterator[tuple[Episode, str, int]]:
+    """Yield random rows, each with one of the cameras; the same ones every time."""
     dice = np.random.default_rng(1)
     episodes = Dataset(out).episodes
     for _ in range(count):
         episode = episodes[dice.integers(len(episodes))]
-        episode.frame(CAMERAS[dice.integers(2)], int(dice.integers(episode.length)))
+        yield episode, CAMERAS[dice.integers(2)], int(dice.integers(episode.length))
 
 
-def read_all(out: Path) -> None:
+def read_frames(out: Path, count: int) -> None:
+    """Read pictures of random rows."""
+    for episode, camera, row in random_rows(out, count):
+        episode.frame(camera, row)
+
+
+def read_numbers(out: Path, count: int) -> None:
+    """Read the numbers of random rows."""
+    for episode, _, row in random_rows(out, count):
+        assert np.isfinite(episode.columns["action"][row]).all()
+
+
+def read_frames_by_hand(out: Path, count: int, keep_open: bool) -> None:
+    """Read pictures of random rows with PyAV alone; the files are opened each time, or kept open."""
+    import av
+
+    opened: dict[Path, Any] = {}
+    for episode, camera, row in random_rows(out, count):
+        path = episode.files(camera)["color"]
+        container = opened.get(path) or av.open(str(path))
+        stream: Any = container.streams.video[0]
+        wanted = round((episode.first_picture(path) + row) / (FPS * stream.time_base))
+        container.seek(wanted, stream=stream)
+        picture = next(frame for frame in container.decode(stream) if frame.pts >= wanted)
+        assert picture.to_ndarray(format="rgb24").ndim == 3
+        if keep_open:
+            opened[path] = container
+        else:
+            container.close()
+
+
+def read_all(out: Path) -> tuple[Episode, ...]:
     """Open a dataset and read the metadata of each episode, as a list does."""
-    for episode in Dataset(out).episodes:
-        assert episode.info["length"] == episode.length
+    episodes = Dataset(out).episodes
+    assert all(episode.info["length"] == episode.length for episode in episodes)
+    return episodes
 
 
-def report(rig: hal.Rig, part: Path, folder: Path, episodes: int, frames: int) -> None:
-    """Print one column of the table."""
-    out = folder / str(episodes)
-    rows = {"merge": timed(lambda: merge([part] * (episodes // RECORDED), out))}
+def memory(out: Path) -> list[float]:
+    """Return the memory, kB an episode, of the metadata of all episodes, and after a row of each was read."""
+    done = subprocess.run([sys.executable, __file__, "--memory", out], capture_output=True, text=True, check=True)
+    return [float(number) for number in done.stdout.split()]
+
+
+def print_memory(out: Path) -> None:
+    """Print what :func:`memory` returns, of this process."""
+    episodes = read_all(out)[:1]
+    for row in range(2):
+        read_row(episodes[0], row)  # loads the libraries
+    before = resident()
+    episodes = read_all(out)
+    print((resident() - before) / len(episodes))
+    for episode in episodes:
+        read_row(episode, 1)
+    print((resident() - before) / len(episodes))
+
+
+def read_row(episode: Episode, row: int) -> None:
+    """Read the numbers, a picture and the depth of a row."""
+    assert np.isfinite(episode.columns["action"][row]).all()
+    for camera in CAMERAS:
+        assert episode.frame(camera, row).shape[:2] == episode.depth[camera][row].shape
+
+
+def resident() -> float:
+    """Return the memory that this process takes, kB."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize() / 1e3
+
+
+def report(rig: hal.Rig, part: Path, out: Path, frames: int) -> None:
+    """Print one column of the table, of a dataset made of ten times a part."""
+    rows = {"merge ten": timed(lambda: merge([part] * 10, out))}
+    episodes = len(Dataset(out))
     rows["open"] = timed(lambda: Dataset(out))
     rows["open, and read the metadata of all episodes"] = timed(lambda: read_all(out))
-    rows[f"{frames} random frames"] = timed(lambda: random_frames(out, frames))
+    rows[f"{frames} random pictures"] = timed(lambda: read_frames(out, frames))
+    rows["  with PyAV by hand, files kept open"] = timed(lambda: read_frames_by_hand(out, frames, True))
+    rows["  with PyAV by hand, files opened each time"] = timed(lambda: read_frames_by_hand(out, frames, False))
+    rows[f"numbers of {frames} random rows"] = timed(lambda: read_numbers(out, frames))
+    print(f"{episodes} episodes of {SECONDS:g} s with two cameras, at most {OPEN_FILES} open files")
+    for name, size in zip(("of all metadata", "after reading a row of each"), memory(out), strict=True):
+        print(f"  {f'memory {name}, an episode':48s} {size:8.2f} kB")
+    for kind in ("meta", "episodes", "data", "videos"):
+        files = [path for path in (out / kind).rglob("*") if path.is_file()]
+        size = sum(path.stat().st_size for path in files) / episodes / 1e3
+        print(f"  {f'{kind}/, an episode':48s} {size:8.2f} kB in {len(files)} files")
     rows["append: save one more"] = record(rig, out, 2)
     rows["pack after that"] = timed(lambda: pack(out))
     rows["mark one"] = timed(lambda: mark_episodes(out, {episodes // 2: False}))
+    rows["mark a hundred"] = timed(lambda: mark_episodes(out, dict.fromkeys(range(0, episodes, episodes // 100), None)))
     rows["delete the last one"] = timed(lambda: delete_episodes(out, [episodes + 1]))
     rows["delete the first one"] = timed(lambda: delete_episodes(out, [0]))
-    print(f"{episodes} episodes of {SECONDS:g} s with two cameras, at most {OPEN_FILES} open files")
     for name, seconds in rows.items():
-        print(f"  {name:48s} {seconds:8.3f} s")
-    for kind in ("meta/episodes", "data", "videos"):
-        files = [path for path in (out / kind).rglob("*") if path.is_file()]
-        size = sum(path.stat().st_size for path in files) / episodes / 1e3
-        print(f"  {kind:24s} {len(files):4d} files, {size:6.1f} kB an episode")
+        print(f"  {name:48s} {seconds:8.3f} s", flush=True)
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="datasets of many episodes")
-    parser.add_argument("--episodes", type=int, default=1000, help="of the larger dataset (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=10_000, help="of the largest dataset (%(default)s)")
     parser.add_argument("--frames", type=int, default=5000, help="pictures that are read (%(default)s)")
+    parser.add_argument("--memory", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.memory is not None:
+        print_memory(args.memory)
+        return
     resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
     overrides = [f"cameras.{name}.output.{side}={64}" for name in CAMERAS for side in ("width", "height")]
     folder = Path(tempfile.mkdtemp())
     try:
         with hal.open("panda_table", driver="mock", overrides=overrides) as rig:
             record(rig, folder / "part", RECORDED)
-            files = [path for path in (folder / "part/meta/episodes").rglob("*") if path.is_file()]
-            size = sum(path.stat().st_size for path in files) / RECORDED / 1e3
-            print(f"{RECORDED} episodes as they are recorded: {size:.1f} kB an episode in meta/episodes")
-            for episodes in (args.episodes // 10, args.episodes):
-                report(rig, folder / "part", folder, episodes, args.frames)
+            files = [path for kind in ("meta", "episodes") for path in (folder / "part" / kind).rglob("*.*")]
+            size = sum(path.stat().st_size for path in files if path.is_file()) / RECORDED / 1e3
+            print(f"{RECORDED} episodes as they are recorded: {size:.1f} kB an episode in meta/ and episodes/")
+            part, episodes = folder / "part", RECORDED
+            while (episodes := episodes * 10) <= args.episodes:
+                report(rig, part, folder / str(episodes), args.frames)
+                part = folder / str(episodes)
     finally:
         shutil.rmtree(folder)
 

@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 ROOT = Path(__file__).resolve().parents[1]
-ENGINES = tuple(name for name in registry.ENGINES if not registry.missing(name))
+ENGINES = tuple(name for name in registry.ENGINES if not registry.find_missing(name))
 """The engines of the simulation that are installed."""
 
 median = statistics.median

@@ -17,7 +17,7 @@ import hal
 from hal.commands import NO_INBOX, PathSection, Session
 from hal.config import load
 from hal.driver import Reading
-from hal.geometry import after_rotation, difference
+from hal.geometry import apply_rotation, difference
 from hal.kinematics.arm import Kinematics
 from hal.motion.lines import tcp_lines
 from hal.motion.planning import STEP, PathPlanner
@@ -46,7 +46,7 @@ def random_goal(numbers: np.random.Generator, start: list[float], turn: float = 
     way, axis = numbers.normal(size=3), numbers.normal(size=3)
     way *= numbers.uniform(0.05, 0.5) / np.linalg.norm(way)
     axis *= numbers.uniform(0.0, turn) / np.linalg.norm(axis)
-    return [*(np.array(start[:3]) + way).tolist(), *after_rotation(start[3:], axis.tolist())]
+    return [*(np.array(start[:3]) + way).tolist(), *apply_rotation(start[3:], axis.tolist())]
 
 
 def off_line(start: list[float], goal: list[float], poses: list[list[float]]) -> tuple[float, float]:

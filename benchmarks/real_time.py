@@ -57,7 +57,7 @@ def drive(engine: str, rate_hz: float, seconds: float, cameras: bool, realtime: 
                 control.send(hal.Twist([0.05 * np.sin(tick.elapsed), 0.05 * np.cos(tick.elapsed), 0.0]))
                 ages.add(rig.clock.now() - arm.state(max_age=1.0).stamp.t)
                 for camera in rig.cameras.values():
-                    camera.latest(max_age=5.0)
+                    camera.read_latest(max_age=5.0)
                 if tick.elapsed > seconds:
                     break
         period, age = next(iter(rig.statistics().values()))["period_s"], ages.summary()

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import CommandError
 
-__all__ = ["frozen", "number", "vector", "whole"]
+__all__ = ["freeze", "number", "vector", "integer"]
 
 Array = NDArray[np.float64]
 
 
-def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
+def freeze(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
     """Return a read-only copy of ``values`` as an array."""
     array = np.array(values, dtype=dtype)
     array.flags.writeable = False
@@ -43,16 +43,16 @@ def number(
             raise TypeError
         found = float(value)
     except (TypeError, ValueError, OverflowError):
-        raise CommandError(f"{name} must be {_wanted(unit, least, most, above)}, not {_shown(value)}") from None
+        raise CommandError(f"{name} must be {_show_range(unit, least, most, above)}, not {_show(value)}") from None
     if not math.isfinite(found) or found < least or found > most or (above and found == least):
-        raise CommandError(f"{name} must be {_wanted(unit, least, most, above)}, not {found:g}")
+        raise CommandError(f"{name} must be {_show_range(unit, least, most, above)}, not {found:g}")
     return found
 
 
-def whole(name: str, value: Any, *, least: int) -> int:
+def integer(name: str, value: Any, *, least: int) -> int:
     """Return an integer of at least ``least``. Raises CommandError for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise CommandError(f"{name} must be a whole number of at least {least}, not {_shown(value)}")
+        raise CommandError(f"{name} must be a whole number of at least {least}, not {_show(value)}")
     return int(value)
 
 
@@ -63,7 +63,7 @@ def vector(name: str, values: Any, size: int | None = None) -> Array:
         CommandError: Another shape, not numbers, or a number that is not finite.
     """
     try:
-        array = frozen(values)
+        array = freeze(values)
     except (TypeError, ValueError, OverflowError) as error:
         raise CommandError(f"{name} must be numbers: {error}") from None
     if array.ndim != 1 or (size is not None and array.size != size):
@@ -74,14 +74,14 @@ def vector(name: str, values: Any, size: int | None = None) -> Array:
     return array
 
 
-def _wanted(unit: str, least: float, most: float, above: bool) -> str:
+def _show_range(unit: str, least: float, most: float, above: bool) -> str:
     kind = "a positive number" if above and least == 0.0 else "a finite number"
     low = f" of at least {least:g}" if math.isfinite(least) and not above else ""
     high = f"{' and' if low else ' of'} at most {most:g}" if math.isfinite(most) else ""
     return f"{kind}{low}{high}{f' ({unit})' if unit else ''}"
 
 
-def _shown(value: Any) -> str:
+def _show(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
     if isinstance(value, int) and value.bit_length() > 1000:

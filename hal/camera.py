@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from .driver import CameraDriver, CameraInfo, RawFrame
     from .robot import Robot
 
-__all__ = ["Camera", "CameraCounts", "MovingCamera", "frame_from_color", "place_of"]
+__all__ = ["Camera", "CameraCounts", "MovingCamera", "frame_from_color", "find_place"]
 
 _LOG = logging.getLogger("hal.camera")
 _GRAB = 0.1
@@ -44,17 +44,17 @@ Place = Callable[[float], "Pose | None"]
 class Camera:
     """One camera of a rig, the same for every driver; created by :func:`hal.open`.
 
-    In real time a thread takes every frame from the driver, so ``latest`` never waits and a slow reader loses no time.
-    In lock-step ``read`` and ``latest`` both return the present state of the world, which is rendered once.
+    In real time a thread takes every frame from the driver, so ``read_latest`` never waits and a slow reader loses no
+    time. In lock-step it returns the present state of the world, as ``read`` does, which is rendered once.
 
-    When the camera is lost (unplugged, reset, silent), ``read`` and ``latest`` raise ConnectionLost. It is reopened in
-    the background for half an hour; the same object then works again.
+    When the camera is lost (unplugged, reset, silent), both raise ConnectionLost. It is reopened in the background for
+    half an hour; the same object then works again.
 
     Args:
         driver: Driver of the camera.
         clock: The rig's clock.
         threaded: Whether a thread reads ahead.
-        place: Pose of a camera whose driver does not report it; see :func:`place_of`.
+        place: Pose of a camera whose driver does not report it; see :func:`find_place`.
     """
 
     def __init__(self, driver: CameraDriver, clock: Clock, *, threaded: bool, place: Place | None = None) -> None:
@@ -122,14 +122,14 @@ class Camera:
         if not self._threaded:
             return self._grab(timeout, after)
         with self._news:
-            fresh = self._news.wait_for(lambda: self._error is not None or self._unseen(after), timeout)
+            fresh = self._news.wait_for(lambda: self._error is not None or self._find_unseen(after), timeout)
             if self._error is not None:
                 raise self._error
             if not fresh:
                 raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s{describe_load()}")
             return self._return_newest()
 
-    def latest(self, max_age: float = 0.2) -> Frame:
+    def read_latest(self, max_age: float = 0.2) -> Frame:
         """Return the newest frame, whether returned before or not; never waits.
 
         Args:
@@ -201,7 +201,7 @@ class Camera:
                 self._frames, self._dropped, fps, self._ages.percentile(0.5), *tally, reconnects=self._reconnects
             )
 
-    def _unseen(self, after: float | None) -> bool:
+    def _find_unseen(self, after: float | None) -> bool:
         newest = self._newest
         if newest is None or newest.stamp.seq == self._returned_seq:
             return False
@@ -309,7 +309,7 @@ class Camera:
         return lost
 
     def _accept_frame(self, raw: RawFrame) -> Frame:
-        frame = self._frame_of(raw)
+        frame = self._make_frame(raw)
         with self._news:
             back, self._error = self._error is not None, None
             self._newest, self._raw = frame, raw
@@ -331,7 +331,7 @@ class Camera:
                 with self._news:
                     listeners.pop(token, None)
 
-    def _frame_of(self, raw: RawFrame) -> Frame:
+    def _make_frame(self, raw: RawFrame) -> Frame:
         images = {stream: getattr(raw, stream) for stream in STREAMS}
         for image in images.values():
             if image is not None:
@@ -394,7 +394,7 @@ class CameraCounts(NamedTuple):
     """Number of times that the camera was lost and came back."""
 
 
-def place_of(spec: CameraSpec, robots: Mapping[str, Robot]) -> Place | None:
+def find_place(spec: CameraSpec, robots: Mapping[str, Robot]) -> Place | None:
     """Return the pose of the colour sensor's optical frame in the world as a function of time.
 
     Args:

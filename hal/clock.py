@@ -131,12 +131,12 @@ class LockStepClock(Clock):
         if not abs(t) < _LONGEST:
             number("t", t, "s on this clock", most=_LONGEST)
         with self._going:
-            while (stop := self._next(t)) is not None:
+            while (stop := self._find_next(t)) is not None:
                 self._advance_to(stop.due)
                 stop.run(self._now())
             self._advance_to(t)
 
-    def every(self, seconds: float, call: Callable[[], object]) -> Callable[[], None]:
+    def call_every(self, seconds: float, call: Callable[[], object]) -> Callable[[], None]:
         """Call a function at regular simulated times, from the thread that waits then.
 
         An exception of the function is raised by that wait.
@@ -161,7 +161,7 @@ class LockStepClock(Clock):
 
         return detach
 
-    def _next(self, t: float) -> _Stop | None:
+    def _find_next(self, t: float) -> _Stop | None:
         """Return the first stop up to ``t``; of several at the same time, the one that was added first."""
         ahead = [stop for stop in tuple(self._stops) if stop.due <= t + _ROUNDING]
         return min(ahead, key=lambda stop: stop.due, default=None)

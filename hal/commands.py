@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import registry
-from .arguments import frozen, vector
+from .arguments import freeze, vector
 from .errors import CommandError, MotionStopped, NotSupported, Unreachable
 from .geometry import Pose, tcp_pose
 from .types import Trip
@@ -102,7 +102,7 @@ class JointChunk:
     def __init__(self, t: ArrayLike, q: ArrayLike) -> None:
         times = vector("t", t)
         try:
-            points = frozen(q)
+            points = freeze(q)
         except (TypeError, ValueError, OverflowError) as error:
             raise CommandError(f"q must be numbers: {error}") from None
         if not 1 <= times.size <= CHUNK_POINTS:
@@ -406,7 +406,7 @@ class CommandChecks:
         self._takes_torques = False
         """Whether the driver is known to take torques."""
 
-    def checked(self, command: Command, now: float, reasons: list[str]) -> Command:
+    def check_command(self, command: Command, now: float, reasons: list[str]) -> Command:
         """Return the command to send: the same one, or one cut to the limits.
 
         Args:
@@ -426,14 +426,14 @@ class CommandChecks:
         if isinstance(command, CartesianTarget):
             self._check_reach(command)
         elif isinstance(command, JointTarget):
-            q = self._in_limits(command.q, reasons)
+            q = self._clip_to_limits(command.q, reasons)
             return command if q is command.q else JointTarget(q, command.dq)
         elif isinstance(command, JointChunk):
             self._check_times(command, now)
-            q = self._in_limits(command.q, reasons)
+            q = self._clip_to_limits(command.q, reasons)
             return command if q is command.q else JointChunk(command.t, q)
         elif isinstance(command, JointTorque):
-            return self._within_torques(command, reasons)
+            return self._limit_torques(command, reasons)
         return command
 
     def check_first(self, command: Command, now: float, q_set: Sequence[float]) -> None:
@@ -448,7 +448,7 @@ class CommandChecks:
             CommandError: The target is too far away (``code`` is ``first_step_too_far``).
         """
         if isinstance(command, (JointTarget, JointChunk)):
-            first = command.q if isinstance(command, JointTarget) else _target_at(command, now)
+            first = command.q if isinstance(command, JointTarget) else _find_target(command, now)
             step = np.abs(first - np.asarray(q_set))
             worst = int(np.argmax(step))
             if step[worst] > FIRST_STEP_ANGLE:
@@ -505,7 +505,7 @@ class CommandChecks:
                 code="chunk_too_long",
             )
 
-    def _in_limits(self, q: NDArray[np.float64], reasons: list[str]) -> NDArray[np.float64]:
+    def _clip_to_limits(self, q: NDArray[np.float64], reasons: list[str]) -> NDArray[np.float64]:
         """Return ``q`` (n,) or (k, n) cut to the position limits; the same array if that changes nothing."""
         inside: NDArray[np.float64] = np.minimum(np.maximum(q, self._lower), self._upper)
         over = (inside != q).any(axis=0) if q.ndim > 1 else inside != q
@@ -533,7 +533,7 @@ class CommandChecks:
             )
         self._takes_torques = True
 
-    def _within_torques(self, command: JointTorque, reasons: list[str]) -> JointTorque:
+    def _limit_torques(self, command: JointTorque, reasons: list[str]) -> JointTorque:
         most = self._robot.limits.torque
         if most is None:
             return command
@@ -545,7 +545,7 @@ class CommandChecks:
         return JointTorque(np.clip(command.tau, np.negative(most), most))
 
 
-def _target_at(chunk: JointChunk, t: float) -> NDArray[np.float64]:
+def _find_target(chunk: JointChunk, t: float) -> NDArray[np.float64]:
     """Return the joint positions (n,) of a chunk at time ``t``, rad; its first target before its first time."""
     k = int(np.searchsorted(chunk.t, t, side="right"))
     due: NDArray[np.float64] = chunk.q[min(k, len(chunk.t) - 1)]

@@ -95,12 +95,12 @@ class Control:
         self.robot = robot
         self.deadman = deadman
         usual, most = (spec.speed, spec.speed) if streams else (spec.move_speed, 1.0)
-        self.speed = _share("speed", speed, usual, most)
+        self.speed = _choose_share("speed", speed, usual, most)
         if not streams and robot.recorded and self.speed > spec.speed:
             text = f"{robot.name} is recorded: its speed is {spec.speed:g} and not {self.speed:g}, so that a replay"
             warnings.warn(f"{text}, which may be no faster, can follow", RuntimeWarning, stacklevel=5)
             self.speed = spec.speed
-        self.tcp_speed = _share("tcp_speed", tcp_speed, spec.tcp_speed, spec.tcp_speed)
+        self.tcp_speed = _choose_share("tcp_speed", tcp_speed, spec.tcp_speed, spec.tcp_speed)
         self._goal, self._path = goal, path
         self._mail = robot._mail
         self._host = robot._host
@@ -124,11 +124,11 @@ class Control:
         self._at_once = 0
         """Number of commands that were sent without any time passing."""
         self._checks = CommandChecks(robot)
-        self.controller = self._resolved(controller)
-        self._law: dict[str, Any] | None = self._described()
+        self.controller = self._resolve_controller(controller)
+        self._law: dict[str, Any] | None = self._describe_controller()
         """The controller as plain data; None for the arm's own."""
 
-    def _resolved(self, controller: Controller | None) -> Controller:
+    def _resolve_controller(self, controller: Controller | None) -> Controller:
         """Return the controller with a value for every gain, checked against the arm."""
         from .servo.controllers import Position, resolve  # together with the servo's libraries, so only when needed
 
@@ -139,7 +139,7 @@ class Control:
         simulated = registry.load(robot.spec.driver, "robot").simulated
         return resolve(controller, robot.spec, robot.kinematics, self._host.spec.rate_hz, simulated)
 
-    def _described(self) -> dict[str, Any] | None:
+    def _describe_controller(self) -> dict[str, Any] | None:
         from .servo.controllers import controller_data
 
         return controller_data(self.controller)
@@ -264,8 +264,8 @@ class Control:
         from .servo.controllers import with_gains
 
         self._require_open()
-        before, self.controller = self.controller, self._resolved(with_gains(self.controller, gains))
-        law = self._described()
+        before, self.controller = self.controller, self._resolve_controller(with_gains(self.controller, gains))
+        law = self._describe_controller()
         try:
             self._host.request("gains", {"robot": self.robot.name, "session": self._id, "controller": law})
         except HalError:
@@ -359,7 +359,7 @@ class Control:
         """Send a command to the servo, checked before; return what was sent."""
         if self._goal is not None or self._path is not None:
             raise CommandError("this session makes one motion; it takes no commands", code="move_to_session")
-        command = self._checks.checked(command, now, reasons)
+        command = self._checks.check_command(command, now, reasons)
         if isinstance(command, JointTorque) and self._law:
             raise CommandError("this session has a controller: it takes no torques", code="torques_by_controller")
         self._check_time(now)
@@ -486,7 +486,7 @@ class Control:
         if grip is not None:
             width = gripper.width_of(grip)
         assert width is not None
-        width, _, force = gripper._checked(width, None, force)
+        width, _, force = gripper._check_motion(width, None, force)
         return width, force
 
     def _send_fingers(self, target: tuple[float, float], waiting: bool, reasons: list[str]) -> None:
@@ -503,7 +503,7 @@ class Control:
             self._grip = (*target, gripper._send(self._id, *target))
 
 
-def _share(name: str, value: float | None, default: float, most: float) -> float:
+def _choose_share(name: str, value: float | None, default: float, most: float) -> float:
     """Return ``value`` or the default, checked against the most that the rig allows."""
     return number(name, default if value is None else value, least=0.0, above=True, most=most)
 

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import Fault, NotSupported
-from .geometry import Pose, frozen
+from .geometry import Pose, freeze
 from .types import GripperOutcome
 
 if TYPE_CHECKING:
@@ -477,15 +477,15 @@ class CameraDriver(DeviceDriver):
     def nominal_info(self, title: str = "") -> CameraInfo:
         """Return the figures of the model, for a camera that reports none itself; ``title`` is its make and model."""
         spec, streams = self.spec, {}
-        distortion = frozen(spec.distortion)
+        distortion = freeze(spec.distortion)
         for name, s in spec.sensors.items():
             pose = Pose(s.position, s.orientation)
-            streams[name] = StreamInfo(s.format, s.width, s.height, s.rate_hz, frozen(s.K), distortion, pose)
+            streams[name] = StreamInfo(s.format, s.width, s.height, s.rate_hz, freeze(s.K), distortion, pose)
         infrared = spec.K_infrared or (spec.K if {"infrared", "infrared_right"} & set(spec.streams) else None)
-        K_infrared = None if infrared is None else frozen(infrared)
+        K_infrared = None if infrared is None else freeze(infrared)
         clock = "simulated" if self.simulated else "hardware"
         made = MappingProxyType(streams)
-        return CameraInfo(title or spec.model, frozen(spec.K), distortion, K_infrared, clock, streams=made)
+        return CameraInfo(title or spec.model, freeze(spec.K), distortion, K_infrared, clock, streams=made)
 
     @abstractmethod
     def grab(self, timeout: float) -> RawFrame | None:

@@ -90,7 +90,7 @@ class Dynamics:
         self._inverse_columns: NDArray[np.intp] | None = None
         if columns != list(range(self.n)):
             self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
-        self.damping: tuple[float, ...] = tuple(self._in_order(self._model.damping).tolist())
+        self.damping: tuple[float, ...] = tuple(self._restore_order(self._model.damping).tolist())
         """Viscous damping of each joint (n,), Nm s/rad: simulated arms have it, the methods leave it out."""
 
     @classmethod
@@ -115,7 +115,7 @@ class Dynamics:
 
     def gravity(self, q: Floats) -> Array:
         """Return the joint torques (n,), Nm, that hold the arm still at ``q`` (n,), rad."""
-        return self._in_order(self._pin.computeGeneralizedGravity(self._model, self._data, self._ordered(q)))
+        return self._restore_order(self._pin.computeGeneralizedGravity(self._model, self._data, self._reorder(q)))
 
     def inverse(self, q: Floats, dq: Floats, ddq: Floats) -> Array:
         """Return the joint torques (n,), Nm, of a motion: gravity, Coriolis and inertia.
@@ -125,13 +125,13 @@ class Dynamics:
             dq: Joint velocities (n,), rad/s.
             ddq: Joint accelerations (n,), rad/s2.
         """
-        ordered = self._ordered
-        return self._in_order(self._pin.rnea(self._model, self._data, ordered(q), ordered(dq), ordered(ddq)))
+        ordered = self._reorder
+        return self._restore_order(self._pin.rnea(self._model, self._data, ordered(q), ordered(dq), ordered(ddq)))
 
     def coriolis(self, q: Floats, dq: Floats) -> Array:
         """Return the Coriolis and centrifugal torques (n,), Nm, at ``q`` (n,) rad and ``dq`` (n,) rad/s."""
-        effects = self._pin.nonLinearEffects(self._weightless, self._data, self._ordered(q), self._ordered(dq))
-        return self._in_order(effects)
+        effects = self._pin.nonLinearEffects(self._weightless, self._data, self._reorder(q), self._reorder(dq))
+        return self._restore_order(effects)
 
     def forward(self, q: Floats, dq: Floats, tau: Floats) -> Array:
         """Return the joint accelerations (n,), rad/s2, under torques: the inverse of :meth:`inverse`.
@@ -141,12 +141,12 @@ class Dynamics:
             dq: Joint velocities (n,), rad/s.
             tau: All torques of the joints (n,), Nm, those that carry the arm's weight included.
         """
-        ordered = self._ordered
-        return self._in_order(self._pin.aba(self._model, self._data, ordered(q), ordered(dq), ordered(tau)))
+        ordered = self._reorder
+        return self._restore_order(self._pin.aba(self._model, self._data, ordered(q), ordered(dq), ordered(tau)))
 
     def mass_matrix(self, q: Floats) -> Array:
         """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad. It is symmetric and positive definite."""
-        mass = self._pin.crba(self._model, self._data, self._ordered(q))
+        mass = self._pin.crba(self._model, self._data, self._reorder(q))
         inertia: Array = mass.copy() if self._columns is None else mass[np.ix_(self._columns, self._columns)]
         return inertia
 
@@ -161,7 +161,7 @@ class Dynamics:
             q: Joint positions (n,), rad.
         """
         pin, model, data = self._pin, self._model, self._data
-        position = self._ordered(q)
+        position = self._reorder(q)
         jacobian = pin.computeFrameJacobian(
             model, data, position, self._tcp, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         ).copy()
@@ -178,13 +178,13 @@ class Dynamics:
         inertia = self._pin.Inertia(payload.mass, lever, np.zeros((3, 3)))
         self._model.appendBodyToJoint(frame.parentJoint, inertia, self._pin.SE3.Identity())
 
-    def _ordered(self, values: Floats) -> Array:
+    def _reorder(self, values: Floats) -> Array:
         array = np.array(values, float)
         if array.shape != self._shape:
             raise CommandError(f"one number for each joint is needed, shape {self._shape}, not {array.shape}")
         return array if self._inverse_columns is None else array[self._inverse_columns]
 
-    def _in_order(self, array: Array) -> Array:
+    def _restore_order(self, array: Array) -> Array:
         """Return a copy of pinocchio's vector, in the order of the spec."""
         values: Array = array.copy() if self._columns is None else array[self._columns]
         return values

@@ -28,7 +28,7 @@ __all__ = [
     "RUMBLE_SECONDS",
     "RUMBLE_STRONG",
     "RUMBLE_WEAK",
-    "without_dead_zone",
+    "apply_dead_zone",
 ]
 
 RUMBLE_STRONG, RUMBLE_WEAK, RUMBLE_SECONDS = 1.0, 0.5, 0.5
@@ -159,7 +159,7 @@ class Gamepad:
             Whether the pad vibrates; False for one that cannot, or that is not connected.
         """
         try:
-            return self.driver.rumble(_share(strong), _share(weak), seconds if seconds > 0.0 else 0.0)
+            return self.driver.rumble(_clip_share(strong), _clip_share(weak), seconds if seconds > 0.0 else 0.0)
         except Exception as error:
             self._rumble_error = error
             return False
@@ -240,7 +240,7 @@ class Gamepad:
                 self._gate.shut()
                 buttons = frozenset()
             live = reading.connected and self._gate.open
-            axes = {name: self._shaped(name, reading.axes.get(name, 0.0)) if live else 0.0 for name in AXES}
+            axes = {name: self._shape_axis(name, reading.axes.get(name, 0.0)) if live else 0.0 for name in AXES}
             for held in self._held.values():
                 held.update(reading, gate_open=live)
             last = self._state
@@ -255,10 +255,10 @@ class Gamepad:
             for event in self._wakers:
                 event.set()
 
-    def _shaped(self, name: str, value: float) -> float:
+    def _shape_axis(self, name: str, value: float) -> float:
         if name.startswith("dpad"):
-            return without_dead_zone(value, 0.0)
-        return without_dead_zone(value, max(self.driver.flat.get(name, 0.0), self.driver.spec.dead_zone))
+            return apply_dead_zone(value, 0.0)
+        return apply_dead_zone(value, max(self.driver.flat.get(name, 0.0), self.driver.spec.dead_zone))
 
     def close(self) -> None:
         """Stop polling and release the device; every dead-man is released. Idempotent."""
@@ -273,7 +273,7 @@ class Gamepad:
         self._lose(self._state.stamp.t)
 
 
-def _share(value: float) -> float:
+def _clip_share(value: float) -> float:
     """Return ``value`` within 0..1; 0 for NaN."""
     return min(1.0, value) if value > 0.0 else 0.0
 
@@ -344,7 +344,7 @@ class HeldControl:
         self.deadman.update(pressed, reading.connected, reading.t_alive)
 
 
-def without_dead_zone(value: float, zone: float) -> float:
+def apply_dead_zone(value: float, zone: float) -> float:
     """Return ``value`` (-1..1), cut to 0 within ``zone`` and stretched to start from 0 at its edge; 0 for NaN."""
     if not abs(value) > zone or zone >= 1.0:
         return 0.0

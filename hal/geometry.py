@@ -13,16 +13,16 @@ from math import atan2, cos, hypot, sin
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import frozen, vector
+from .arguments import freeze, vector
 from .errors import CommandError
 
 __all__ = [
     "Pose",
     "Transform",
-    "after_rotation",
+    "apply_rotation",
     "compose",
     "difference",
-    "frozen",
+    "freeze",
     "inverse",
     "matrix_to_quaternion",
     "quaternion_to_matrix",
@@ -34,7 +34,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 
-_UNTURNED = frozen(np.array([0.0, 0.0, 0.0, 1.0]))
+_UNTURNED = freeze(np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +63,7 @@ class Pose:
         norm = float(np.linalg.norm(q))
         if not 1e-9 < norm < np.inf:
             raise CommandError(f"orientation must be a unit quaternion x, y, z, w, not {q.tolist()}")
-        object.__setattr__(self, "orientation", frozen(q / norm))
+        object.__setattr__(self, "orientation", freeze(q / norm))
 
     @property
     def has_orientation(self) -> bool:
@@ -71,7 +71,7 @@ class Pose:
         return self.orientation is not _UNTURNED
 
     @classmethod
-    def trusted(cls, position: Array, orientation: Array) -> Pose:
+    def from_arrays(cls, position: Array, orientation: Array) -> Pose:
         """Return a pose of read-only arrays (3,) and (4,), finite and normalised; nothing is checked."""
         pose = cls.__new__(cls)
         object.__setattr__(pose, "position", position)
@@ -235,7 +235,7 @@ def rotate(quaternion: Floats, vector: Floats) -> list[float]:
     return [x + 2.0 * (qy * cz - qz * cy), y + 2.0 * (qz * cx - qx * cz), z + 2.0 * (qx * cy - qy * cx)]
 
 
-def after_rotation(quaternion: Floats, vector: Floats) -> list[float]:
+def apply_rotation(quaternion: Floats, vector: Floats) -> list[float]:
     """Return the orientation (4,) after a rotation by the rotation vector (3,) in rad; both in the parent frame."""
     x, y, z = vector
     angle = hypot(x, y, z)

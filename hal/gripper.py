@@ -80,7 +80,7 @@ class Gripper:
         """Raise ConnectionLost if the process that owns the gripper is gone."""
         self._host.check()
 
-    def newest(self) -> GripperState | None:
+    def peek(self) -> GripperState | None:
         """Return the newest state of any age; None before the first."""
         found = self._mail.get()
         return None if found is None else found.state
@@ -154,7 +154,7 @@ class Gripper:
             force: Greatest force on an object in between, N, up to the model's ``force_max``; the gripper's default if
                 left out.
         """
-        return self._start_motion(GripperAct.MOVE, *self._checked(width, speed, force))
+        return self._start_motion(GripperAct.MOVE, *self._check_motion(width, speed, force))
 
     def start_grasp(
         self,
@@ -179,7 +179,7 @@ class Gripper:
         """
         for name, value in (("inner", inner), ("outer", outer)):
             number(name, value, "m", least=0.0)
-        return self._start_motion(GripperAct.GRASP, *self._checked(width, speed, force), inner, outer)
+        return self._start_motion(GripperAct.GRASP, *self._check_motion(width, speed, force), inner, outer)
 
     def start_home(self) -> GripperMotion:
         """Start to measure how far the fingers open. Some grippers need it once after they are switched on.
@@ -193,7 +193,7 @@ class Gripper:
         self.check()
         self._put(self._latch.stops, GripperAct.STOP)
 
-    def _checked(self, width: float, speed: float | None, force: float | None) -> tuple[float, float, float]:
+    def _check_motion(self, width: float, speed: float | None, force: float | None) -> tuple[float, float, float]:
         speed = self.spec.speed if speed is None else speed
         force = self.spec.force if force is None else force
         return (
@@ -223,7 +223,7 @@ class Gripper:
 
     def _was_stopped(self, number: int) -> bool:
         """Return whether the newest command is the one of this number, and was stopped before its end."""
-        state = self.newest()
+        state = self.peek()
         return state is not None and state.target_seq == number and state.outcome is GripperOutcome.STOPPED
 
     def _put(self, stops: int, act: GripperAct, *numbers: float, session: int = 0) -> int:
@@ -365,7 +365,7 @@ class GripperMotion:
 
     def _find_result(self) -> GripperResult | None:
         """Return the result, or None while the motion runs."""
-        state = self._gripper.newest() if self._result is None else None
+        state = self._gripper.peek() if self._result is None else None
         if self._result is None and state is not None:
             if state.target_seq > self._seq:
                 self._result = GripperResult(GripperOutcome.STOPPED, state, None)

@@ -50,7 +50,7 @@ class Intrinsics(NamedTuple):
     cx: float
     cy: float
 
-    def through(self, crop: Crop, width: int, height: int) -> Intrinsics:
+    def crop_and_scale(self, crop: Crop, width: int, height: int) -> Intrinsics:
         """Return the intrinsics of the image that is cut out and scaled to ``width`` x ``height``."""
         sx, sy = width / crop.width, height / crop.height
         return Intrinsics(
@@ -206,7 +206,7 @@ class Cropping:
     def matrix(self, K: Array) -> Array:
         """Return the camera matrix (3, 3) of the output, for ``K`` (3, 3) of the input."""
         before = Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-        return np.array(before.through(self.crop, *self.size).matrix())
+        return np.array(before.crop_and_scale(self.crop, *self.size).matrix())
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Crop and scale an image (H, W, 3) or (H, W); always returns a new array."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import StaleStateError
-from .geometry import Pose, after_rotation, difference
+from .geometry import Pose, apply_rotation, difference
 from .host.memory import History
 from .types import GripperState, RobotState, Stamp
 
@@ -38,25 +38,25 @@ def robot_at(history: History[RobotState], t: float, name: str) -> RobotState:
     if share == 0.0:
         return before
 
-    def mixed(a: Array | None, b: Array | None) -> Array | None:
+    def mix_known(a: Array | None, b: Array | None) -> Array | None:
         return None if a is None or b is None else a + share * (b - a)
 
-    def sure(a: Array, b: Array) -> Array:
+    def mix(a: Array, b: Array) -> Array:
         return a + share * (b - a)
 
     return replace(
         before,
         stamp=_stamp(before.stamp, after.stamp, share),
-        q=sure(before.q, after.q),
-        dq=sure(before.dq, after.dq),
-        tau=mixed(before.tau, after.tau),
-        q_set=sure(before.q_set, after.q_set),
-        dq_set=sure(before.dq_set, after.dq_set),
+        q=mix(before.q, after.q),
+        dq=mix(before.dq, after.dq),
+        tau=mix_known(before.tau, after.tau),
+        q_set=mix(before.q_set, after.q_set),
+        dq_set=mix(before.dq_set, after.dq_set),
         tcp=_pose(before.tcp, after.tcp, share),
         tcp_set=_pose(before.tcp_set, after.tcp_set, share),
-        tcp_twist=sure(before.tcp_twist, after.tcp_twist),
-        tau_ext=mixed(before.tau_ext, after.tau_ext),
-        wrench_ext=mixed(before.wrench_ext, after.wrench_ext),
+        tcp_twist=mix(before.tcp_twist, after.tcp_twist),
+        tau_ext=mix_known(before.tau_ext, after.tau_ext),
+        wrench_ext=mix_known(before.wrench_ext, after.wrench_ext),
     )
 
 
@@ -98,5 +98,5 @@ def _stamp(a: Stamp, b: Stamp, share: float) -> Stamp:
 
 def _pose(a: Pose, b: Pose, share: float) -> Pose:
     twist = difference((*a.position, *a.orientation), (*b.position, *b.orientation))
-    turned = after_rotation(a.orientation.tolist(), [share * value for value in twist[3:]])
+    turned = apply_rotation(a.orientation.tolist(), [share * value for value in twist[3:]])
     return Pose(a.position + share * (b.position - a.position), turned)

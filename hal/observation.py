@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from .arguments import number, whole
+from .arguments import integer, number
 from .errors import CommandError, DeviceNotFound, StaleStateError
 from .types import Frame, GripperState, RobotState
 
@@ -74,7 +74,7 @@ class Observer:
         self, after: float | None, timeout: float, history: int, cameras: Collection[str] | None
     ) -> Observation:
         """Take an observation; see :meth:`hal.rig.Rig.observe`."""
-        whole("history", history, least=1)
+        integer("history", history, least=1)
         number("timeout", timeout, "s", least=0.0)
         if after is not None:
             ahead = number("after", after, "s on rig.clock") - self._rig.clock.now()
@@ -107,7 +107,7 @@ class Observer:
         if after is not None:
             return camera.read(timeout, after=after)
         try:
-            return camera.latest(max_age=_FRESH)
+            return camera.read_latest(max_age=_FRESH)
         except StaleStateError:
             return camera.read(timeout)
 
@@ -143,7 +143,7 @@ class Observer:
             state = known.get(robot.name)
             robots[robot.name] = state if state is not None and state.stamp.t == t else robot.state_at(t)
             if robot.gripper is not None:
-                grip = robot.gripper.newest()
+                grip = robot.gripper.peek()
                 if grip is None or grip.stamp.t != t:
                     grip = self._gripper_at(robot.gripper, t)
                 grippers[robot.name] = grip

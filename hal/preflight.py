@@ -28,11 +28,11 @@ __all__ = [
     "Level",
     "REALTIME_RIGHT",
     "check_machine",
-    "checked_cameras",
+    "list_checked_cameras",
     "has_realtime_kernel",
     "may_lock_memory",
     "preflight",
-    "real_arms",
+    "list_real_arms",
 ]
 
 Level = Literal["ok", "warn", "fail", "unknown"]
@@ -77,18 +77,18 @@ def preflight(
         yield _check_engine(plan.engine)
         if cameras:
             yield from _check_pictures(plan)
-    devices: list[RobotSpec | CameraSpec] = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
+    devices: list[RobotSpec | CameraSpec] = [*list_real_arms(plan), *(list_checked_cameras(plan) if cameras else ())]
     for device in devices:
         for result in _check(device, duration):
             yield replace(result, name=f"{device.name}: {result.name}")
 
 
-def real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
+def list_real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
     """Return the arms of a rig that are real or emulated."""
     return tuple(robot for robot in plan.robots if robot.attended or robot.emulated)
 
 
-def checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
+def list_checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
     """Return the cameras of a rig whose driver can check them before they are opened."""
     return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
 
@@ -159,10 +159,10 @@ def check_machine(root: Path = _ROOT) -> Iterator[CheckResult]:
     if not sys.platform.startswith("linux"):
         yield CheckResult("machine", "unknown", f"cannot check {sys.platform}", "use Linux for a real arm")
         return
-    yield _kernel(root)
-    yield _frequency(root)
-    yield _scheduling()
-    yield _memory(root)
+    yield _check_kernel(root)
+    yield _check_frequency(root)
+    yield _check_scheduling()
+    yield _check_memory(root)
 
 
 def has_realtime_kernel(root: Path = _ROOT) -> bool | None:
@@ -174,7 +174,7 @@ def has_realtime_kernel(root: Path = _ROOT) -> bool | None:
     return _text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version or "PREEMPT RT" in version
 
 
-def _kernel(root: Path) -> CheckResult:
+def _check_kernel(root: Path) -> CheckResult:
     realtime = has_realtime_kernel(root)
     if realtime is None:
         return CheckResult("kernel", "unknown", "cannot read /proc/version")
@@ -185,7 +185,7 @@ def _kernel(root: Path) -> CheckResult:
     return CheckResult("kernel", "warn", found, _KERNELS.get(_distribution(root), "install a kernel with PREEMPT_RT"))
 
 
-def _frequency(root: Path) -> CheckResult:
+def _check_frequency(root: Path) -> CheckResult:
     """Check the frequency governor: processors that slow down to save power wake up late."""
     governors = {text for path in root.glob(_GOVERNORS) if (text := _text(path))}
     if not governors:
@@ -196,7 +196,7 @@ def _frequency(root: Path) -> CheckResult:
     return CheckResult("processor", "warn", f"saves power and then wakes up late (governor {saving})", _FULL_SPEED)
 
 
-def _scheduling() -> CheckResult:
+def _check_scheduling() -> CheckResult:
     priority = os.sched_get_priority_max(os.SCHED_FIFO)
     if _may_be_fifo(priority):
         return CheckResult("scheduling", "ok", f"SCHED_FIFO is allowed, up to priority {priority}")
@@ -229,7 +229,7 @@ def may_lock_memory(root: Path = _ROOT) -> bool:
     return limit == resource.RLIM_INFINITY or bool((_capabilities(root) or 0) >> _IPC_LOCK & 1)
 
 
-def _memory(root: Path) -> CheckResult:
+def _check_memory(root: Path) -> CheckResult:
     if may_lock_memory(root):
         return CheckResult("memory", "ok", "all of a process's memory may be locked")
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]

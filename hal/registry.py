@@ -32,13 +32,13 @@ __all__ = [
     "DriverSpec",
     "PadInput",
     "check_engine",
-    "checked",
+    "check_record",
     "choose_engine",
     "driver",
     "function",
     "is_engine",
     "load",
-    "missing",
+    "find_missing",
     "names",
     "pad_driver",
     "provider",
@@ -177,7 +177,7 @@ def driver(name: str) -> DriverSpec:
         place = _entry_points().get(name)
     if place is None:
         raise DeviceNotFound(
-            f"there is no driver {name!r}{_nearest(name, names())}; drivers: {', '.join(names())}",
+            f"there is no driver {name!r}{_suggest(name, names())}; drivers: {', '.join(names())}",
             code="unknown_driver",
         )
     spec = _resolve(place, name, {})
@@ -227,7 +227,7 @@ def explain_engine(choice: str) -> str | None:
     if choice == "auto" or (choice != SIMULATION and is_engine(choice)):
         return None
     there = ("auto", *ENGINES)
-    return f"{choice!r} is no engine{_nearest(choice, there)}: {', '.join(there)}, or a driver with a world"
+    return f"{choice!r} is no engine{_suggest(choice, there)}: {', '.join(there)}, or a driver with a world"
 
 
 def choose_engine(choice: str) -> str:
@@ -237,7 +237,7 @@ def choose_engine(choice: str) -> str:
     """
     if choice != "auto":
         return choice
-    return next((name for name in ENGINES if not missing(name)), ENGINES[0])
+    return next((name for name in ENGINES if not find_missing(name)), ENGINES[0])
 
 
 def check_engine(name: str) -> None:
@@ -247,15 +247,15 @@ def check_engine(name: str) -> None:
         DriverMissing: A library that it needs is not installed; the message has the command that installs it, and
             those of all engines if none is installed (``code`` is ``missing_engine``).
     """
-    lacking = missing(name)
+    lacking = find_missing(name)
     if not lacking:
         return
-    there = [other for other in ENGINES if other != name and not missing(other)]
+    there = [other for other in ENGINES if other != name and not find_missing(other)]
     install = " and ".join(lacking.values())
     if there:
         advice = f"install it with: {install}; or use the engine {there[0]!r}"
     else:
-        others = [command for other in ENGINES if other != name for command in missing(other).values()]
+        others = [command for other in ENGINES if other != name for command in find_missing(other).values()]
         advice = f"install it with: {install}; or install another engine: {', '.join(others)}"
     message = f"the simulation engine {name!r} is not installed; {advice}"
     raise DriverMissing(message, name=next(iter(lacking)), code="missing_engine")
@@ -291,7 +291,7 @@ def load(name: str, kind: str) -> Any:
     spec = driver(name)
     if kind not in _KINDS:
         raise NotSupported(
-            f"there is no kind of driver {kind!r}{_nearest(kind, _KINDS)}; kinds: {', '.join(_KINDS)}",
+            f"there is no kind of driver {kind!r}{_suggest(kind, _KINDS)}; kinds: {', '.join(_KINDS)}",
             code="unknown_kind",
         )
     place = getattr(spec, kind)
@@ -314,7 +314,7 @@ def function(name: str, place: str | None) -> Callable[..., Any] | None:
     return found
 
 
-def checked(name: str, kind: str, record: object) -> list[tuple[str, str, str]]:
+def check_record(name: str, kind: str, record: object) -> list[tuple[str, str, str]]:
     """Return the mistakes that a driver finds in a device's record.
 
     Returns:
@@ -325,7 +325,7 @@ def checked(name: str, kind: str, record: object) -> list[tuple[str, str, str]]:
     return [(key, message, *(code or ("invalid",))) for key, message, *code in check(record)] if check else []
 
 
-def missing(name: str, device: object = None) -> dict[str, str]:
+def find_missing(name: str, device: object = None) -> dict[str, str]:
     """Return the libraries that a driver needs and that are not installed -> the command that installs each.
 
     Imports none of them, so a program can report what is missing before it opens anything.
@@ -370,6 +370,6 @@ def _entry_points() -> dict[str, str]:
     return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
-def _nearest(word: str, choices: tuple[str, ...]) -> str:
+def _suggest(word: str, choices: tuple[str, ...]) -> str:
     close = get_close_matches(word, choices, n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

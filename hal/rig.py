@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 
 from . import registry
-from .camera import Camera, place_of
+from .camera import Camera, find_place
 from .clock import Clock, LockStepClock, RealClock
 from .commands import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
@@ -155,11 +155,11 @@ class Rig:
             self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
         self._wait_for_hosts(realtime)
         if world_host is not None:
-            self.world = World(world_host.request, partial(self._world_edited, world_host))
+            self.world = World(world_host.request, partial(self._pass_on_edit, world_host))
         for host in self._hosts:
             self.notes.extend(host.request("warnings"))
             for spec in host.spec.robots:
-                gripper, collisions = self._gripper_of(spec), plan.collisions
+                gripper, collisions = self._make_gripper(spec), plan.collisions
                 robot = Robot(spec, host, self.clock, gripper, collisions, self.robots)
                 self.robots[spec.name] = robot
         for opened in (self.console, self.viewer3d):
@@ -213,7 +213,7 @@ class Rig:
                 world_host = host
         return world_host
 
-    def _gripper_of(self, robot: RobotSpec) -> Gripper | None:
+    def _make_gripper(self, robot: RobotSpec) -> Gripper | None:
         spec = robot.gripper
         if spec is None:
             return None
@@ -239,11 +239,11 @@ class Rig:
             drawn = self._pictures is not None and spec.name in self._pictures
             source: object = self._pictures.source(spec.name) if self._pictures and drawn else self.clock
             driver = registry.load(spec.driver, "camera")(spec, source)
-            place = place_of(spec, self.robots) if not driver.simulated else None
+            place = find_place(spec, self.robots) if not driver.simulated else None
             camera = Camera(driver, self.clock, threaded=not self.lock_step, place=place)
             self._devices[spec.name] = driver
             self.cameras[spec.name] = camera
-            camera.on_connection(partial(self._camera_news, spec.name))
+            camera.on_connection(partial(self._announce_camera, spec.name))
             camera.open()
         for camera in self.cameras.values():
             if not camera.wait_for_first(_FIRST_FRAME):
@@ -413,7 +413,7 @@ class Rig:
         if self.console is not None:
             self.console.say(text)
 
-    def _camera_news(self, name: str, lost: ConnectionLost | None) -> None:
+    def _announce_camera(self, name: str, lost: ConnectionLost | None) -> None:
         self.say(f"camera {name} is back" if lost is None else str(lost))
 
     def rearm(self) -> None:
@@ -423,7 +423,7 @@ class Rig:
         """
         self._latch.rearm()
 
-    def _world_edited(self, host: Host, method: str, params: dict[str, Any], revision: int) -> None:
+    def _pass_on_edit(self, host: Host, method: str, params: dict[str, Any], revision: int) -> None:
         if method == "add":
             self.notes.extend(text for text in host.request("warnings") if text not in self.notes)
         for shown in (self._pictures, self._viewer, self.viewer3d):
@@ -513,7 +513,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     wrong = [
         Problem("--pad", "", message, code)
         for chosen in pads
-        for _, message, code in registry.checked(chosen.spec.driver, "gamepad", chosen.spec)
+        for _, message, code in registry.check_record(chosen.spec.driver, "gamepad", chosen.spec)
     ]
     if wrong:
         raise ConfigError(wrong)

@@ -18,7 +18,7 @@ from .arguments import number, vector
 from .clock import describe_load
 from .control import Control, check_deadman
 from .errors import CommandError, ConnectionLost, NotSupported, StaleStateError
-from .geometry import Pose, frozen, tcp_pose
+from .geometry import Pose, freeze, tcp_pose
 from .motion.handle import CHECK_HZ, ArmMotion
 from .specs import CollisionSpec
 from .types import RobotState, RobotStatus
@@ -101,7 +101,7 @@ class Robot:
     @property
     def home(self) -> NDArray[np.float64]:
         """Home position (n,) of the model, rad."""
-        return frozen(self.spec.home)
+        return freeze(self.spec.home)
 
     @property
     def base(self) -> Pose:
@@ -415,10 +415,10 @@ class Robot:
         if position is not None:
             target = Pose(vector("position", position, 3), self.state().tcp_set.orientation)
         if straight:
-            return self._along([tcp_pose("a straight motion's target", target)], 0.0, terms)
+            return self._plan_along([tcp_pose("a straight motion's target", target)], 0.0, terms)
         if not isinstance(target, Pose) and (points := _waypoints(target)) is not None:
             goals = [self._goal(point) for point in points]
-            return self._following(self._planner().plan_joints(self._start_position(), goals), terms)
+            return self._make_motion(self._planner().plan_joints(self._start_position(), goals), terms)
         assert target is not None
         goal = self._goal(target)
         self._check_collisions(np.array([self.state().q, goal]))
@@ -429,13 +429,13 @@ class Robot:
         number("blend", blend, "m", least=0.0)
         if isinstance(poses, Pose) or not len(poses):
             raise CommandError("pass move_along a sequence of poses, at least one")
-        return self._along([tcp_pose(f"poses[{k}]", pose) for k, pose in enumerate(poses)], blend, terms)
+        return self._plan_along([tcp_pose(f"poses[{k}]", pose) for k, pose in enumerate(poses)], blend, terms)
 
-    def _along(self, poses: Sequence[Pose], blend: float, terms: dict[str, Any]) -> ArmMotion:
+    def _plan_along(self, poses: Sequence[Pose], blend: float, terms: dict[str, Any]) -> ArmMotion:
         values = [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in poses]
-        return self._following(self._planner().plan_poses(self._start_position(), values, blend), terms)
+        return self._make_motion(self._planner().plan_poses(self._start_position(), values, blend), terms)
 
-    def _following(self, plan: MotionPlan, terms: dict[str, Any]) -> ArmMotion:
+    def _make_motion(self, plan: MotionPlan, terms: dict[str, Any]) -> ArmMotion:
         if plan.sections:
             return ArmMotion(self, Control(self, path=plan.sections, **terms))
         return ArmMotion(self, Control(self, goal=tuple(self._start_position()), **terms))  # it is there already

@@ -141,9 +141,9 @@ class TeleopSession:
         on_tick: Callable[[], None] | None = None,
     ) -> None:
         self.rig = rig
-        robots = _listed(robot, list(rig.robots.values())[:1], f"{rig.plan.source} has no robot", "no_robot")
+        robots = _list_given(robot, list(rig.robots.values())[:1], f"{rig.plan.source} has no robot", "no_robot")
         missing = f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'"
-        pads = _listed(pad, list(rig.gamepads.values()), missing, "no_gamepad")
+        pads = _list_given(pad, list(rig.gamepads.values()), missing, "no_gamepad")
         self._several = len(robots) > 1
         self.arms = tuple(
             ArmTeleop(arms, pad, mapping, speed, self._announce) for pad, arms in share_pads(robots, pads)
@@ -372,7 +372,7 @@ class TeleopSession:
                 self._hold_others()
                 if self._on_tick is not None:
                     self._on_tick()
-                if due := until(self.pad.state()) or self._due(len(controls) < len(self.arms)):
+                if due := until(self.pad.state()) or self._find_due(len(controls) < len(self.arms)):
                     return due
         raise AssertionError("a paced loop does not end")
 
@@ -435,7 +435,7 @@ class TeleopSession:
             elif arm.held_for:
                 arm.held_for = ""
 
-    def _due(self, lacking: bool) -> str | _Due:
+    def _find_due(self, lacking: bool) -> str | _Due:
         """Return what has to be done outside of the control sessions, if anything; ``lacking``: an arm has none."""
         for arm in self.arms:
             state = arm.pad.state()
@@ -555,7 +555,7 @@ def _brake(controls: Iterable[Control]) -> None:
         control.brake()
 
 
-def _listed(given: T | Sequence[T] | None, default: Sequence[T], missing: str, code: str) -> list[T]:
+def _list_given(given: T | Sequence[T] | None, default: Sequence[T], missing: str, code: str) -> list[T]:
     """Return what was given as a list, else ``default``. Raises CommandError if it is empty."""
     if given is None:
         found = list(default)

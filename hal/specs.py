@@ -124,11 +124,11 @@ class GripperSpec:
 
     def travel_at(self, width: float) -> float:
         """Return the share of their way, from closed to open, that the joints have gone at a width, m."""
-        return _interpolated(width, [(b, a) for a, b in self.travel])
+        return _interpolate(width, [(b, a) for a, b in self.travel])
 
     def width_at(self, share: float) -> float:
         """Return the width, m, at a share of the way of the joints from closed to open."""
-        return _interpolated(share, self.travel)
+        return _interpolate(share, self.travel)
 
     @cached_property
     def travel(self) -> list[tuple[float, float]]:
@@ -139,7 +139,7 @@ class GripperSpec:
         return sorted(((angle - shut) / way, width) for angle, width in self.widths)
 
 
-def _interpolated(x: float, table: list[tuple[float, float]]) -> float:
+def _interpolate(x: float, table: list[tuple[float, float]]) -> float:
     """Return the value at ``x`` of pairs with ascending ``x``; beyond their ends the outermost lines continue."""
     k = 1
     while k < len(table) - 1 and x > table[k][0]:

@@ -146,7 +146,7 @@ class Teleop:
             return 0.0 if pad.pressed(str(mapping.open)) else None
         wanted = min(1.0, max(0.0, pad.axis(mapping.axis)))
         if not self._has_grip:
-            state = gripper.newest()
+            state = gripper.peek()
             if state is None or gripper.trouble:
                 return None  # the width is unknown
             difference = wanted - gripper.grip_at(state.width)
@@ -158,7 +158,7 @@ class Teleop:
     def _toggle(self, pressed: bool, gripper: Gripper) -> float | None:
         """Return the grip of a press, for as long as it lasts, so that no single command matters."""
         if pressed and not self._was_toggle:
-            state = gripper.newest()
+            state = gripper.peek()
             if state is not None and not gripper.trouble:
                 closed = state.grasped is True or gripper.grip_at(state.width_target) > _HALF
                 self._toggled = 0.0 if closed else 1.0
@@ -251,10 +251,10 @@ def twist_towards(goal: Pose, tcp: Pose, linear: float, angular: float) -> Twist
         angular: Greatest angular speed, rad/s.
     """
     left = difference((*tcp.position, *tcp.orientation), (*goal.position, *goal.orientation))
-    return Twist(_capped(left[:3], linear), _capped(left[3:], angular))
+    return Twist(_cap(left[:3], linear), _cap(left[3:], angular))
 
 
-def _capped(left: Sequence[float], most: float) -> list[float]:
+def _cap(left: Sequence[float], most: float) -> list[float]:
     distance = hypot(*left)
     return [min(_GAIN, most / distance) * part for part in left] if distance > 0.0 else [0.0, 0.0, 0.0]
 
@@ -352,7 +352,7 @@ class ArmTeleop:
         """The arm to which the mapping's button ``other_arm`` hands the pad on."""
         return self.robots[(self.robots.index(self.robot) + 1) % len(self.robots)]
 
-    def due_mapping(self) -> str:
+    def choose_mapping(self) -> str:
         """Return the mapping to use: the wanted one, else that of the plugged-in pad, else the present one."""
         if self._mapping_wanted or (self.mapping and not self.pad.state().connected):
             return self._mapping_wanted or self.mapping
@@ -360,13 +360,13 @@ class ArmTeleop:
 
     def load_mapping(self) -> None:
         """Use the mapping that is due. Its dead-man must be released and pressed before it counts."""
-        self.mapping = self.due_mapping()
+        self.mapping = self.choose_mapping()
         self.teleop = Teleop(self.robot, mapping=self.mapping, speed=self._speed)
         self.deadman = self.pad.hold(self.teleop.mapping.deadman)
 
     def other_pad_ready(self) -> bool:
         """Return whether a pad with another mapping is plugged in and may drive this arm."""
-        if self.due_mapping() == self.mapping:
+        if self.choose_mapping() == self.mapping:
             return False
         spec = self.robot.spec
         why = (self.pad.distrust() or "") if spec.attended and not spec.emulated else ""
@@ -483,7 +483,7 @@ def share_pads(robots: Sequence[Robot], pads: Sequence[Gamepad]) -> list[tuple[G
         robots: The arms to drive, at least one.
         pads: The pads, at least one; those that are not needed are left out.
     """
-    pads = _distinct(pads)
+    pads = _drop_shared(pads)
     left = {robot.name: robot for robot in robots}
     shared: list[tuple[Gamepad, list[Robot]]] = []
     for pad in pads:
@@ -500,7 +500,7 @@ def share_pads(robots: Sequence[Robot], pads: Sequence[Gamepad]) -> list[tuple[G
     return sorted(shared, key=lambda entry: order.index(entry[1][0]))
 
 
-def _distinct(pads: Sequence[Gamepad]) -> list[Gamepad]:
+def _drop_shared(pads: Sequence[Gamepad]) -> list[Gamepad]:
     """Leave out further pads whose input is that of one before: the page, or the keys. One thumb, one dead-man."""
     found: list[Gamepad] = []
     inputs: set[str] = set()

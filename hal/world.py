@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import CommandError, NotSupported
-from .geometry import Pose, frozen
+from .geometry import Pose, freeze
 from .specs import BodySpec, WorldSpec, from_json, to_json
 
 __all__ = ["BodyJoint", "Contact", "Contacts", "NoWorld", "Poses", "RayHit", "World", "WorldDriver", "WorldState"]
@@ -172,16 +172,16 @@ class World:
             name: Name of the body.
             link: Name of a link; None for the base.
         """
-        return _pose(self._call("pose", name=name, link=link))
+        return _decode_pose(self._call("pose", name=name, link=link))
 
     def poses(self, names: Collection[str] | None = None) -> Poses:
         """Return the poses of several bodies' bases at one moment, in one request; of all bodies by default."""
         found = self._call("poses", names=None if names is None else list(names))
-        return Poses(float(found["t"]), {name: _pose(pose) for name, pose in found["poses"].items()})
+        return Poses(float(found["t"]), {name: _decode_pose(pose) for name, pose in found["poses"].items()})
 
     def set_pose(self, name: str, pose: Pose) -> None:
         """Place a body, at rest. Robots are moved by their servo, or by :meth:`reset`."""
-        self._call("set_pose", name=name, pose=_plain(pose))
+        self._call("set_pose", name=name, pose=_encode_pose(pose))
 
     def spec(self, name: str) -> BodySpec:
         """Return the record of an object: its shape, size and mass as it was loaded or added.
@@ -224,7 +224,7 @@ class World:
     def velocity(self, name: str) -> tuple[Array, Array]:
         """Return the linear (3,) m/s and the angular (3,) rad/s velocity of a body's base, in the world."""
         linear, angular = self._call("velocity", name=name)
-        return frozen(linear), frozen(angular)
+        return freeze(linear), freeze(angular)
 
     def set_velocity(self, name: str, linear: ArrayLike = (0, 0, 0), angular: ArrayLike = (0, 0, 0)) -> None:
         """Set the linear (3,) m/s and the angular (3,) rad/s velocity of a body's base, in the world."""
@@ -272,7 +272,7 @@ class World:
         Returns:
             The gravity before, for a later call.
         """
-        return frozen(self._call("set_gravity", gravity=np.asarray(gravity, float).tolist()))
+        return freeze(self._call("set_gravity", gravity=np.asarray(gravity, float).tolist()))
 
     def ray(self, start: ArrayLike, end: ArrayLike) -> RayHit | None:
         """Return what a straight ray meets first; None if nothing with a collision shape is in its way.
@@ -285,7 +285,7 @@ class World:
         found = self._call("ray", start=np.asarray(start, float).tolist(), end=np.asarray(end, float).tolist())
         if found is None:
             return None
-        return RayHit(**(found | {"position": frozen(found["position"]), "normal": frozen(found["normal"])}))
+        return RayHit(**(found | {"position": freeze(found["position"]), "normal": freeze(found["normal"])}))
 
     def distance(self, a: str, b: str, link_a: str | None = None, link_b: str | None = None) -> float:
         """Return the smallest distance between the collision shapes of two bodies, m; negative if they overlap.
@@ -319,7 +319,7 @@ class World:
         return dict(self._call("set_dynamics", name=name, link=link, **values))
 
     @contextmanager
-    def changed_dynamics(self, name: str, link: str | None = None, **values: float) -> Iterator[None]:
+    def change_dynamics(self, name: str, link: str | None = None, **values: float) -> Iterator[None]:
         """Change some of the values of :meth:`dynamics` for the duration of a ``with`` block."""
         before = self.set_dynamics(name, link, **values)
         try:
@@ -336,7 +336,7 @@ class World:
         """
         found = self._call("contacts", a=a, b=b, stamped=True)
         contacts = (
-            Contact(**(contact | {"position": frozen(contact["position"]), "normal": frozen(contact["normal"])}))
+            Contact(**(contact | {"position": freeze(contact["position"]), "normal": freeze(contact["normal"])}))
             for contact in found["contacts"]
         )
         return Contacts(contacts, found["t"])
@@ -344,7 +344,7 @@ class World:
     def aabb(self, name: str) -> tuple[Array, Array]:
         """Return the lower and the upper corner (3,) of a body's axis-aligned bounding box in the world, m."""
         found = self._call("aabb", name=name)
-        return frozen(found["lower"]), frozen(found["upper"])
+        return freeze(found["lower"]), freeze(found["upper"])
 
     def reset(self, name: str | None = None, *, pose: Pose | None = None, q: ArrayLike | None = None) -> None:
         """Reset one body, or everything, to its configured pose and joint positions, at rest.
@@ -356,7 +356,7 @@ class World:
         """
         params: dict[str, Any] = {"name": name}
         if pose is not None:
-            params["pose"] = _plain(pose)
+            params["pose"] = _encode_pose(pose)
         if q is not None:
             params["q"] = np.asarray(q, float).tolist()
         self._request("world.reset", params)
@@ -550,13 +550,13 @@ class WorldDriver(ABC):
         """Delete the world and free its memory. Idempotent."""
 
 
-def _pose(data: Mapping[str, Any] | Sequence[Any]) -> Pose:
+def _decode_pose(data: Mapping[str, Any] | Sequence[Any]) -> Pose:
     if isinstance(data, Mapping):
         return Pose(data["position"], data["orientation"])
     return Pose(*data)
 
 
-def _plain(pose: Pose) -> dict[str, list[float]]:
+def _encode_pose(pose: Pose) -> dict[str, list[float]]:
     if not isinstance(pose, Pose):
         raise CommandError(f"pose must be a hal.Pose, not {type(pose).__name__}", code="not_a_pose")
     return {"position": pose.position.tolist(), "orientation": pose.orientation.tolist()}

@@ -105,7 +105,7 @@ def _failed(name: str, fault: Fault) -> CheckResult:
 
 
 def _missing(library: str) -> CheckResult:
-    command = registry.missing("franka").get(library, "pip install 'robot-hal[franka]'")
+    command = registry.find_missing("franka").get(library, "pip install 'robot-hal[franka]'")
     return CheckResult("library", "fail", f"{library} does not import", command)
 
 
@@ -171,7 +171,7 @@ def _check_hand(spec: RobotSpec) -> Iterator[CheckResult]:
     gripper = spec.gripper
     if gripper is None or gripper.driver != spec.driver:
         return
-    if _HAND_LIBRARY in registry.missing("franka"):
+    if _HAND_LIBRARY in registry.find_missing("franka"):
         yield _missing(_HAND_LIBRARY)
     host = HandSettings.of(gripper).host
     address = resolve_host(host)

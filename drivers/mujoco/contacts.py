@@ -117,22 +117,25 @@ def add_pairs(spec: Any, bodies: Collection[Body]) -> None:
 
 def friction_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, int, float, float]]:
     """Yield the links (body and number of each) whose contacts are not MuJoCo's own, with friction and restitution."""
+    for a, k, b, m in _solid_pairs(bodies):
+        pair = one, other = a.contacts[k], b.contacts[m]
+        friction = one.lateral_friction * other.lateral_friction
+        soft = [link for link in pair if link.contact_stiffness is not None]
+        bounce = 0.0 if soft else one.restitution * other.restitution
+        used = max(link.lateral_friction for link in (soft if len(soft) == 1 else pair))
+        if abs(USUAL_FRICTION * used - friction) > 1e-9 or bounce > 0.0:
+            yield a, k, b, m, friction, bounce
+
+
+def _solid_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, int]]:
+    """Yield the links (body and number of each) of different bodies that may touch."""
     for a, b in itertools.combinations(bodies, 2):
         if a.carried or b.carried or not (a.floating or a.movable or b.floating or b.movable):
             continue
         skip_a, skip_b = a.ignored_by(b), b.ignored_by(a)
-        for (k, one), (m, other) in itertools.product(enumerate(a.contacts), enumerate(b.contacts)):
-            if not (a.solids[k] and b.solids[m]) or k in skip_a or m in skip_b:
-                continue
-            soft_one, soft_other = one.contact_stiffness is not None, other.contact_stiffness is not None
-            bounce = 0.0 if soft_one or soft_other else one.restitution * other.restitution
-            if soft_one == soft_other:
-                used = max(one.lateral_friction, other.lateral_friction)
-            else:
-                used = (one if soft_one else other).lateral_friction
-            right = one.lateral_friction * other.lateral_friction
-            if abs(USUAL_FRICTION * used - right) > 1e-9 or bounce > 0.0:
-                yield a, k, b, m, right, bounce
+        for k, m in itertools.product(range(len(a.contacts)), range(len(b.contacts))):
+            if a.solids[k] and b.solids[m] and k not in skip_a and m not in skip_b:
+                yield a, k, b, m
 
 
 def find_contacts(

@@ -13,7 +13,7 @@ from typing import Any
 
 from hal.driver import CameraDriver, CameraInfo, CameraTally, RawFrame, StreamInfo
 from hal.errors import ConnectionLost, DeviceNotFound
-from hal.geometry import Pose, frozen
+from hal.geometry import Pose, freeze
 from hal.host.process import Child, SharedMemory, unpack_error
 from hal.host.ring import FrameRing
 from hal.specs import CameraSpec, to_json
@@ -390,17 +390,17 @@ def _info_from(opened: Mapping[str, Any]) -> CameraInfo:
             width=stream["width"],
             height=stream["height"],
             rate_hz=stream["rate_hz"],
-            K=frozen(stream["K"]),
-            distortion=frozen(stream["distortion"]),
+            K=freeze(stream["K"]),
+            distortion=freeze(stream["distortion"]),
             T_color_stream=Pose(*stream["T_color_stream"]),
         )
         for name, stream in opened["streams"].items()
     }
     return CameraInfo(
         title=opened["title"],
-        K=frozen(opened["K"]),
-        distortion=frozen(opened["distortion"]),
-        K_infrared=frozen(opened["K_infrared"]) if opened["K_infrared"] is not None else None,
+        K=freeze(opened["K"]),
+        distortion=freeze(opened["distortion"]),
+        K_infrared=freeze(opened["K_infrared"]) if opened["K_infrared"] is not None else None,
         clock=opened["clock"],
         serial=opened["serial"],
         firmware=opened["firmware"],

@@ -56,7 +56,7 @@ class ViserViewer(Viewer3D):
         """
         super().__init__(rig)
         groups = rig.shared_states()
-        for library, command in registry.missing("viser").items():
+        for library, command in registry.find_missing("viser").items():
             raise DriverMissing(f"the 3D view needs {library}; install it with: {command}", name=library)
         self._robots = frozenset(robot.name for group in groups for robot in group.spec.robots)
         self._goals: dict[str, _ReportedGoal] = {}

@@ -339,11 +339,11 @@ def check_robot_spec(
         model: The arm's model.
         file: The model's file.
     """
-    _add(context, key, "", registry.checked(spec.driver, "robot", spec), config, model, file)
+    _add(context, key, "", registry.check_record(spec.driver, "robot", spec), config, model, file)
     gripper, kind = spec.gripper, model.gripper
     if gripper is None or kind is None:
         return
-    found = registry.checked(gripper.driver, "gripper", gripper)
+    found = registry.check_record(gripper.driver, "gripper", gripper)
     if gripper.driver == spec.driver:  # problems in the arm's own options were added above
         own = {**kind.real, **config.gripper.real}
         arms = {f"real.{name}" for name in registry.driver(spec.driver).shared_options if name not in own}
@@ -355,7 +355,7 @@ def check_camera_spec(
     context: Context, key: str, spec: CameraSpec, config: CameraConfig, model: CameraModel, file: Path
 ) -> None:
     """Add the problems that the driver of a camera finds in its record; arguments as in :func:`check_robot_spec`."""
-    _add(context, key, "", registry.checked(spec.driver, "camera", spec), config, model, file)
+    _add(context, key, "", registry.check_record(spec.driver, "camera", spec), config, model, file)
 
 
 def _add(

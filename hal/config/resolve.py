@@ -164,7 +164,7 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         real=real,
     )
     if spec.driver != CHOSEN_LATER:
-        for relative, message, code in registry.checked(spec.driver, "gamepad", spec):
+        for relative, message, code in registry.check_record(spec.driver, "gamepad", spec):
             context.report(f"{key}.{relative}", message, code)
     return spec
 

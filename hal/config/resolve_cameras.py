@@ -96,7 +96,7 @@ def _crop_matrix(sensor: SensorSpec, output: Output) -> Any:
     """Return the camera matrix (3, 3) of a sensor's images after crop and scaling."""
     (fx, _, cx), (_, fy, cy), _ = sensor.K
     crop = centre_crop(sensor.width, sensor.height, output.width, output.height)
-    return Intrinsics(fx, fy, cx, cy).through(crop, output.width, output.height).matrix()
+    return Intrinsics(fx, fy, cx, cy).crop_and_scale(crop, output.width, output.height).matrix()
 
 
 def _check_place(context: Context, key: str, config: CameraConfig) -> None:

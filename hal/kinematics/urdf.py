@@ -16,7 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from xml.parsers import expat
 
-from ..geometry import Pose, after_rotation, rotate
+from ..geometry import Pose, apply_rotation, rotate
 from .mesh_files import check_mesh, is_installed, mesh_file
 
 __all__ = ["UrdfJoint", "UrdfLink", "UrdfMimic", "UrdfModel", "UrdfVisual", "parse_xml", "read_urdf"]
@@ -110,7 +110,7 @@ class UrdfJoint:
             value = self.mimic.multiplier * values.get(self.mimic.of, 0.0) + self.mimic.offset
         along = [value * part for part in self.axis]
         if self.kind in TURNING:
-            orientation = after_rotation(orientation, along)
+            orientation = apply_rotation(orientation, along)
         elif self.kind == "prismatic":
             position = [a + b for a, b in zip(position, along, strict=True)]
         return position, orientation

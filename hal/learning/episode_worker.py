@@ -219,7 +219,7 @@ class EpisodeWorker:
         def expire() -> None:
             raise _TimeOver
 
-        detach = rig.clock.every(self.recipe.seconds, expire)  # type: ignore[attr-defined]  # a LockStepClock
+        detach = rig.clock.call_every(self.recipe.seconds, expire)  # type: ignore[attr-defined]  # a LockStepClock
         try:
             returned = skill(rig, generator)
             success = None if returned is None else bool(returned)

@@ -26,7 +26,7 @@ from ..commands import FIRST_STEP_ANGLE, CartesianTarget, Command, JointTarget, 
 from ..control import Control
 from ..deadman import Deadman
 from ..errors import CommandError, DriverMissing, MotionStopped, NotSupported, RobotFault
-from ..geometry import Pose, after_rotation
+from ..geometry import Pose, apply_rotation
 from ..observation import Observation
 from ..rig import Rig, open_rig
 from ..robot import Robot
@@ -261,7 +261,7 @@ class _EnvArm:
         distance, turn = reached.distance(self.goal)
         if distance > _MAX_LEAD[0] or turn > _MAX_LEAD[1]:  # the arm was held back: the goal must not run ahead
             self.goal = reached
-        turned = after_rotation(self.goal.orientation.tolist(), numbers[3:].tolist())
+        turned = apply_rotation(self.goal.orientation.tolist(), numbers[3:].tolist())
         self.goal = Pose(self.goal.position + numbers[:3], turned)
         return CartesianTarget(self.goal), grip
 

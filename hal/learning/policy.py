@@ -360,7 +360,7 @@ class PolicyRunner:
             return
         if command is not None and first:  # a first target that is far away is refused, as in any session
             checks, now = CommandChecks(control.robot), self.rig.clock.now()
-            checks.check_first(checks.checked(command, now, []), now, control.robot.state().q_set.tolist())
+            checks.check_first(checks.check_command(command, now, []), now, control.robot.state().q_set.tolist())
         if isinstance(command, JointChunk) and command.q.shape[1] == control.robot.n:
             check_targets(control.robot, command.t, command.q)
         control.send(command, grip=grip)

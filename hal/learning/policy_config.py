@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from ..config.files import load_record
 from ..config.schema import Flag, Quantity, Strict, ValueProblem
 from ..errors import DeviceNotFound, NotSupported, PolicyError, Unreachable
-from ..geometry import Pose, after_rotation, difference, quaternion_to_matrix
+from ..geometry import Pose, apply_rotation, difference, quaternion_to_matrix
 
 if TYPE_CHECKING:
     from ..gripper import Gripper
@@ -256,7 +256,7 @@ class ActionConfig(Strict):
 
 def _move_pose(pose: Pose, step: Array) -> Pose:
     """Return a pose after a step (6,): a translation, m, and a rotation vector, rad, along the base's axes."""
-    return Pose(pose.position + step[:3], after_rotation(pose.orientation.tolist(), step[3:].tolist()))
+    return Pose(pose.position + step[:3], apply_rotation(pose.orientation.tolist(), step[3:].tolist()))
 
 
 def _find_share(robot: Robot, q: Array, goal: Array, period: float) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from math import ceil, hypot
 
-from ..geometry import after_rotation, difference
+from ..geometry import apply_rotation, difference
 
 __all__ = ["METRES_PER_RADIAN", "REVERSAL", "STRAIGHT_ON", "Corner", "Segment", "TcpLine", "tcp_lines"]
 
@@ -170,4 +170,4 @@ def tcp_lines(poses: Sequence[Floats], blend: float) -> list[TcpLine]:
 def _move_pose(pose: Floats, way: Floats) -> list[float]:
     """Return a pose (7,) after a translation and a rotation vector (6,) along the base's axes."""
     x, y, z, *orientation = pose
-    return [x + way[0], y + way[1], z + way[2], *after_rotation(orientation, way[3:])]
+    return [x + way[0], y + way[1], z + way[2], *apply_rotation(orientation, way[3:])]

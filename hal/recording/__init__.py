@@ -20,11 +20,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .changing import mark_episodes
     from .curation import find_motion, split, trim
     from .dataset import CameraDepth, Dataset, Episode, EpisodeDepth, KeptRows
-    from .finish import recover, repair
-    from .merging import delete_episodes, extract, mark_episodes, merge, pack, set_task
+    from .merging import delete_episodes, extract, merge, pack, set_task
     from .recorder import Recorder, RecorderStatus
+    from .repairing import recover, repair
 
 __all__ = [
     "CameraDepth",
@@ -58,11 +59,11 @@ _HOME = {
     "delete_episodes": "merging",
     "extract": "merging",
     "find_motion": "curation",
-    "mark_episodes": "merging",
+    "mark_episodes": "changing",
     "merge": "merging",
     "pack": "merging",
-    "recover": "finish",
-    "repair": "finish",
+    "recover": "repairing",
+    "repair": "repairing",
     "set_task": "merging",
     "split": "curation",
     "trim": "curation",

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import CommandError, DatasetError
+from .about import read_about
+from .codecs import Stats, merge_stacked, merge_stats
 from .dataset import Dataset, Episode
 from .foreign import is_foreign
-from .index import check_next_episode, dataset_errors, read_about, read_entries, read_index, read_tasks, stray_files
+from .index import check_next_episode, read_entries, read_index, read_tasks, stats_parts, stray_files
 from .layout import (
     BOOKKEEPING,
     SEGMENTATION,
@@ -28,6 +30,7 @@ from .layout import (
     finish_replacement,
     video_names,
 )
+from .validation import dataset_errors
 
 __all__ = [
     "check_compatible",
@@ -41,6 +44,8 @@ __all__ = [
 
 _CLOSE = 1e-4
 """Difference of a time stamp that LeRobot tolerates, s."""
+_CLOSE_STATS = 1e-6
+"""Difference of a statistic that comes from rounding, as a share of the largest value."""
 
 
 def check_dataset(dataset: Dataset, episodes: Collection[int] | None = None) -> Iterator[DatasetError]:
@@ -170,8 +175,38 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
             stats = json.loads(layout.stats.read_text(encoding="utf-8"), parse_constant=_no_constant)
             if start is not None and stats[STATE]["count"] != [start]:
                 yield wrong(layout.stats, f"counts {stats[STATE]['count']} rows, and there are {start}")
+            elif start is not None:
+                yield from (wrong(layout.stats, what) for what in _stats_differences(layout, stats))
     except DatasetError as error:
         yield error
+
+
+def _stats_differences(layout: DatasetLayout, stats: Mapping[str, Any]) -> Iterator[str]:
+    """Yield where ``meta/stats.json`` is not what follows from the statistics of each episode.
+
+    A number that some episodes do not know was averaged over those that were there when it was added: only its extremes
+    are compared.
+    """
+    parts: dict[str, list[Stats]] = {}
+    partly: set[str] = set()
+    for key, found in stats_parts(layout):
+        parts.setdefault(key, []).append(merge_stacked(found))
+        if np.isnan(found["mean"]).any():
+            partly.add(key)
+    expected = {key: found for key, each in parts.items() if np.isfinite((found := merge_stats(each))["mean"]).all()}
+    if missing := [key for key in expected if key not in stats]:
+        yield f"has no statistics of {', '.join(missing[:3])}"
+    for key, found in expected.items():
+        if key not in stats:
+            continue
+        scale = np.maximum(np.abs(found["min"]), np.abs(found["max"]))
+        for name, value in found.items():
+            if key in partly and name not in ("min", "max"):
+                continue
+            there = np.array(stats[key][name], np.float64)
+            close = _CLOSE_STATS * (1.0 if name == "count" else scale) + 1e-12
+            if there.shape != value.shape or not np.all(np.abs(there - value) <= close):
+                yield f"{name} of {key} is not that of the episodes"
 
 
 def _check_entry(
@@ -194,7 +229,7 @@ def _check_entry(
     }
     with dataset_errors(layout.root, path, number):
         if place.entry not in entries:
-            entries[place.entry] = read_entries(path, stats=False)
+            entries[place.entry] = read_entries(path)
         row = entries[place.entry][number]
         for key, value in expected.items():
             if row[key] != value:

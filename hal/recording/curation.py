@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError
-from .codecs import key_frames
+from .changing import existing_episodes
 from .dataset import Dataset, Episode, KeptRows
-from .index import checked_name, dataset_errors
 from .layout import (
     GRID,
     SETPOINT,
@@ -27,7 +26,9 @@ from .layout import (
     put_in_place,
     video_names,
 )
-from .merging import existing_episodes, extract, merge, open_dataset
+from .merging import extract, merge, open_dataset
+from .validation import checked_name, dataset_errors
+from .videos import key_frames
 
 __all__ = ["KeptRows", "find_motion", "shares", "split", "trim"]
 

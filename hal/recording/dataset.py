@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import threading
 import weakref
+from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
-from itertools import islice
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, overload
 
@@ -16,12 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, DeviceNotFound
-from .codecs import DepthReader, count_frames, read_video
+from .about import read_about
+from .codecs import DepthReader
 from .foreign import is_foreign, read_foreign
-from .index import dataset_errors, read_about, read_index, repair_command
+from .index import read_index, repair_command
 from .layout import (
+    GRIP_FORCE,
     MORE_STREAMS,
     SEGMENTATION,
+    SETPOINT,
     SUCCESS,
     TIMES,
     DatasetLayout,
@@ -32,6 +36,8 @@ from .layout import (
     require_libraries,
     video_key,
 )
+from .validation import dataset_errors
+from .videos import count_frames, read_picture, read_video
 
 __all__ = ["CameraDepth", "Dataset", "Episode", "EpisodeDepth", "KeptRows"]
 
@@ -51,33 +57,60 @@ class _Columns(dict[str, NDArray[Any]]):
         raise DatasetError(f"has no column {key}", file=file, episode=episode)
 
 
-class _ColumnMemory:
-    """Forgets the columns of the episodes that were read first, when those of all need too much memory.
+class _ReadMemory:
+    """Forgets what was read first of the episodes, when that of all needs too much memory.
 
     Args:
-        limit: Size of all columns, bytes.
+        limit: Size of all, bytes.
     """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._used = 0
-        self._read: deque[tuple[weakref.ref[Episode], int]] = deque()
+        self._read: deque[tuple[weakref.ref[Episode], str, int]] = deque()
         self._lock = threading.Lock()
 
-    def add(self, episode: Episode, columns: _Columns) -> None:
-        """Add the columns that an episode has just read."""
-        size = sum(values.nbytes for values in columns.values())
+    def add(self, episode: Episode, name: str, size: int) -> None:
+        """Add what an episode has just read: an attribute that it reads again when it is needed, and its bytes."""
         with self._lock:
             self._used += size
             while self._used > self.limit and self._read:
-                oldest, freed = self._read.popleft()
+                oldest, attribute, freed = self._read.popleft()
                 self._used -= freed
                 if (other := oldest()) is not None:
-                    other.__dict__.pop("columns", None)
-            self._read.append((weakref.ref(episode), size))
+                    other.__dict__.pop(attribute, None)
+            self._read.append((weakref.ref(episode), name, size))
 
 
-_MEMORY = _ColumnMemory(500_000_000)
+def _bytes(arrays: Mapping[str, NDArray[Any]]) -> int:
+    return sum(values.nbytes + 256 for values in arrays.values())  # an array takes some bytes of its own
+
+
+_MEMORY = _ReadMemory(500_000_000)
+
+
+@lru_cache(maxsize=32)
+def _metadata(path: Path, version: tuple[int, int] | None) -> Any:
+    """Return the metadata of a Parquet file; ``version`` is that of the file now."""
+    import pyarrow.parquet as pq
+
+    return pq.read_metadata(path)
+
+
+@lru_cache(maxsize=1024)
+def _group_ends(path: Path, version: tuple[int, int] | None) -> list[int]:
+    """Return the number of rows up to the end of each row group of a file."""
+    found = _metadata(path, version)
+    return list(accumulate(found.row_group(k).num_rows for k in range(found.num_row_groups)))
+
+
+@lru_cache(maxsize=16)
+def _read_groups(path: Path, version: tuple[int, int] | None, groups: range) -> Any:
+    """Return some row groups of a file, which short episodes share."""
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path, metadata=_metadata(path, version), page_checksum_verification=True) as file:
+        return file.read_row_groups(list(groups), use_threads=False)
 
 
 class KeptRows(NamedTuple):
@@ -88,10 +121,7 @@ class KeptRows(NamedTuple):
     """Row after the last one."""
 
 
-_SAME = ("cameras", "features", "rig", "versions")
-"""Metadata that is long and nearly always that of the other episodes."""
-_shared = lru_cache(maxsize=64)(json.loads)
-_MAY_CHANGE = {"files": None, "task": None, "success": None}
+_MAY_CHANGE = dict.fromkeys(("common", "files", "grasps", "success", "task"))
 """Metadata that an episode can get later."""
 
 
@@ -118,19 +148,14 @@ class Episode:
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """Content of ``episodes/N.json``: seed, cameras, gaps, versions, the rig's whole configuration.
+        """Metadata of the episode: seed, cameras, gaps, versions, the rig's whole configuration.
 
-        Not to be changed: what is the same in many episodes is in memory once.
+        Not to be changed: what is the same in many episodes is on the disk and in memory once.
         """
         if self._about is not None:
             return self._about
         self._version = file_version(self._layout.about(self.number))
-        return self._read_about()
-
-    def _read_about(self) -> dict[str, Any]:
-        """Return ``episodes/N.json``, with the values of :data:`_SAME` shared by all episodes."""
-        found = read_about(self._layout, self.number)
-        return found | {key: _shared(json.dumps(found[key])) for key in _SAME if key in found}
+        return read_about(self._layout, self.number)
 
     def _is_current(self) -> bool:
         """Return whether the known place is that of the episode's files now."""
@@ -144,7 +169,7 @@ class Episode:
         known = self.info
         if self._is_current():
             return
-        version, found = file_version(self._layout.about(self.number)), self._read_about()
+        version, found = file_version(self._layout.about(self.number)), read_about(self._layout, self.number)
         if known | _MAY_CHANGE != found | _MAY_CHANGE:
             raise self._changed()
         self._version, self.info = version, found
@@ -212,31 +237,26 @@ class Episode:
             values = (column.flatten() if shape else column).to_numpy(zero_copy_only=False)
             if str(values.dtype) != feature["dtype"] or values.size != self.length * int(np.prod(shape)):
                 raise self._wrong(path, f"{key} is not {feature['dtype']} {feature['shape']} in every row")
-            found[current_key(key)] = values.reshape(-1, *shape)
-        _MEMORY.add(self, found)
+            own = np.array(values.reshape(-1, *shape))  # no view of rows that other episodes share
+            own.flags.writeable = False
+            found[current_key(key)] = own
+        _MEMORY.add(self, "columns", _bytes(found))
         return found
 
     def read_table(self) -> Any:
         """Return the rows as an Arrow table, with the columns as they are stored."""
-        import pyarrow.parquet as pq
-
         self._follow()
         file_number, first = self.place.data
         path = self._layout.data(file_number)
-        with (
-            dataset_errors(self._layout.root, path, self.number),
-            pq.ParquetFile(path, page_checksum_verification=True) as file,
-        ):
-            groups: list[int] = []
-            start = end = 0
-            for k in range(file.metadata.num_row_groups):
-                begin, end = end, end + file.metadata.row_group(k).num_rows
-                if begin < first + self.length and end > first:
-                    start = start if groups else begin
-                    groups.append(k)
-            table = file.read_row_groups(groups, use_threads=False).slice(first - start, self.length)
-            if end < first + self.length:
-                raise self._wrong(path, f"has {end} rows, and the episode ends with row {first + self.length}")
+        with dataset_errors(self._layout.root, path, self.number):
+            version = file_version(path)
+            ends = _group_ends(path, version)
+            rows, end = ends[-1] if ends else 0, first + self.length
+            if rows < end:
+                raise self._wrong(path, f"has {rows} rows, and the episode ends with row {end}")
+            groups = range(bisect_right(ends, first), bisect_left(ends, end) + 1)
+            start = ends[groups[0] - 1] if groups[0] else 0
+            table = _read_groups(path, version, groups).slice(first - start, self.length)
             if set(table["episode_index"].to_pylist()) != {self.number}:
                 raise self._wrong(path, "has rows of another episode")
         self._check_current()
@@ -263,6 +283,7 @@ class Episode:
                 found[key.removeprefix(TIMES)] = start + (value if value.ndim == 1 else value[:, 0])
         if self._about is not None:
             found.setdefault("grid", self.columns["timestamp"].astype(np.float64))
+        _MEMORY.add(self, "stamps", _bytes(found))
         return found
 
     @property
@@ -314,7 +335,7 @@ class Episode:
         path = self._file_of(camera, "color")
         own = range(self.length)[row]
         with dataset_errors(self._layout.root, path, self.number):
-            found = next(read_video(path, self.first_picture(path) + own, self.fps), None)
+            found = read_picture(path, self.first_picture(path) + own, self.fps)
         self._check_current()
         if found is None:
             raise self._wrong(path, f"has no picture of row {own}")
@@ -419,6 +440,11 @@ class CameraDepth(Sequence[NDArray[np.float32]]):
     def __len__(self) -> int:
         return len(self._reader)
 
+    @property
+    def nbytes(self) -> int:
+        """Size in memory, bytes: of the places of the rows in the file."""
+        return self._reader.nbytes
+
     @overload
     def __getitem__(self, row: int) -> NDArray[np.float32]: ...
     @overload
@@ -469,6 +495,7 @@ class EpisodeDepth:
             return self[having[0]][key]
         if key not in self._cameras:
             self._cameras[key] = CameraDepth(self._episode, key)
+            _MEMORY.add(self._episode, "depth", self._cameras[key].nbytes)
         return self._cameras[key]
 
 
@@ -497,11 +524,25 @@ class Dataset:
         self.root = layout.root
         self.info: dict[str, Any] = info
         """``meta/info.json``."""
-        self.notes = () if foreign is None else foreign.notes
-        """What is missing in a dataset that another program edited or recorded."""
+        self._notes = () if foreign is None else foreign.notes
         self.fps: int = info["fps"]
         abouts = [None] * info["total_episodes"] if foreign is None else foreign.episodes
         self.episodes = tuple(Episode(layout, number, info, about) for number, about in enumerate(abouts))
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What is missing in a dataset that another program edited or recorded, or that an earlier version recorded."""
+        if not lacks_grip_force(self.info["features"]):
+            return self._notes
+        repaired = False
+        with contextlib.suppress(DatasetError):  # reported when the episode is read
+            repaired = "grasps" in self.episodes[0].info
+        what = "only proven ones were repaired" if repaired else "hal dataset repair closes those that can be proven"
+        return (
+            *self._notes,
+            f"recorded by an earlier version, without {GRIP_FORCE}: a grasp of a script or a skill is the width of its "
+            f"object in action and {SETPOINT}, and not a closed hand ({what}); how hard the fingers pressed is unknown",
+        )
 
     def has_changed(self) -> bool:
         """Return whether episodes were added, removed or changed since the dataset was opened."""
@@ -512,6 +553,13 @@ class Dataset:
 
     def __repr__(self) -> str:
         return f"<Dataset {self.root}: {len(self.episodes)} episodes, {self.info['total_frames']} rows>"
+
+
+def lacks_grip_force(features: Mapping[str, Any]) -> bool:
+    """Return whether columns are those of an arm with a gripper, but without the force that was asked of it."""
+    stored = {current_key(key): feature for key, feature in features.items()}
+    names = stored.get(SETPOINT, {}).get("names") or []
+    return GRIP_FORCE not in stored and any(name.split(".")[-1] == "gripper" for name in names)
 
 
 def _hint(layout: DatasetLayout) -> str:

@@ -1,4 +1,4 @@
-"""Make an episode of a live folder, recover interrupted ones, and rebuild a lost index.
+"""Make an episode of a live folder: all of its files, and the index with it.
 
 Finishing can be interrupted at any moment and repeated. All files are made inside the partial folder, in ``final/``:
 the episode's own, and ``meta/`` as it will be. Then a list of destinations is written: from here on the episode counts
@@ -18,21 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CommandError, DatasetError, HalError
-from .checking import check_index, check_rows
-from .codecs import Stats, column_stats, merge_stats, picture_stats, remux, stats_as_lists
+from ..errors import DatasetError, HalError
+from .about import split_about
+from .codecs import Stats, column_stats, merge_stats, stats_as_lists
 from .dataset import Episode
-from .index import (
-    _TASK,
-    check_next_episode,
-    dataset_errors,
-    next_place,
-    read_about,
-    read_index,
-    read_tasks,
-    stray_files,
-    validated_info,
-)
+from .index import _TASK, check_next_episode, next_place, read_index, read_tasks
 from .layout import (
     ACTION,
     CHUNK,
@@ -48,30 +38,29 @@ from .layout import (
     VIDEO_MB,
     DatasetLayout,
     EpisodePlace,
-    finish_replacement,
-    lock_dataset,
     read_json,
-    require_libraries,
     sync_to_disk,
     video_key,
-    video_names,
     write_json,
 )
 from .live import LiveContent, read_live
 from .metadata import ClockPace
+from .validation import dataset_errors
+from .videos import picture_stats, remux
 
 __all__ = [
     "CLOSING",
     "entries_table",
     "entry_row",
     "finalise",
-    "write_mark",
-    "new_info",
-    "recover",
+    "finished_episode",
+    "move_files",
     "recover_all",
-    "repair",
+    "new_info",
+    "write_mark",
     "rows_table",
     "stats_of",
+    "stats_row",
     "tasks_table",
     "write_table",
 ]
@@ -134,11 +123,12 @@ def entry_row(
     row |= _at("meta/episodes", place.entry) | {"success": about["success"], "dropped": about.get("dropped")}
     for name, camera in about["cameras"].items():
         row |= {f"camera_matrix/{name}": camera["K"], f"camera_distortion/{name}": camera["distortion"]}
-    for key, found in stats.items():
-        row |= {
-            f"stats/{key}/{name}": value if isinstance(value, list) else value.tolist() for name, value in found.items()
-        }
-    return row
+    return row | stats_row(stats)
+
+
+def stats_row(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the statistics of an episode's columns and videos as columns of ``meta/episodes``."""
+    return {f"stats/{key}/{name}": value.tolist() for key, found in stats.items() for name, value in found.items()}
 
 
 def _at(lead: str, file: int) -> dict[str, int]:
@@ -161,7 +151,8 @@ def write_table(path: Path, table: Any, *, keep_schema: bool = False) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
-    pq.write_table(table, beside, use_dictionary=False, write_statistics=False, store_schema=keep_schema)
+    lean: dict[str, Any] = {"use_dictionary": False, "write_statistics": False, "compression": "zstd"}
+    pq.write_table(table, beside, store_schema=keep_schema, **lean)
     sync_to_disk(beside)
     beside.replace(path)
     sync_to_disk(path.parent)
@@ -231,7 +222,7 @@ def finalise(layout: DatasetLayout, partial: Path, *, recovered: bool = False) -
             return None
         moves = _prepare(layout, rest, recovered)
         write_json(partial / MOVES, moves)
-    return _move(layout, partial)
+    return move_files(layout, partial)
 
 
 def _check_no_links(partial: Path) -> None:
@@ -241,24 +232,57 @@ def _check_no_links(partial: Path) -> None:
             raise ValueError(f"{path.name} is a link")
 
 
-def _move(layout: DatasetLayout, partial: Path) -> int:
+def move_files(layout: DatasetLayout, partial: Path) -> int:
+    """Move the files of a partial folder to their places, and remove it. Return the number of the last episode.
+
+    Only a change of finished episodes replaces files of theirs.
+    """
     moves = []
     for source, target in read_json(partial / MOVES):
         here, there = partial / source, layout.target(target)
         if Path(source).is_absolute() or ".." in Path(source).parts:
             raise ValueError(f"{source!r} is not a file of this folder")
         if here.exists():
-            if there.exists() and not there.is_relative_to(layout.info.parent):
+            own = partial == layout.change or there.is_relative_to(layout.info.parent)
+            if there.exists() and not own:
                 raise DatasetError(
                     "belongs to a finished episode; it is not overwritten", file=target, code="would_overwrite"
                 )
             moves.append((here, there))
-    for here, there in moves:
+    for k, (here, there) in enumerate(moves):
         there.parent.mkdir(parents=True, exist_ok=True)
         here.replace(there)
-        sync_to_disk(there.parent)
+        if k + 1 == len(moves) or moves[k + 1][1].parent != there.parent:
+            sync_to_disk(there.parent)
     layout.remove(partial)
     return int(read_json(layout.info)["total_episodes"]) - 1
+
+
+def recover_all(layout: DatasetLayout) -> list[str]:
+    """Finish what was interrupted in a dataset, which must be locked; see :func:`~hal.recording.recover`."""
+    layout.sweep()
+    done = [finished_episode(layout, partial) for partial in layout.interrupted]
+    if layout.partials():
+        read_index(layout)
+    return done + [finished_episode(layout, partial) for partial in layout.partials()]
+
+
+def finished_episode(layout: DatasetLayout, partial: Path) -> str:
+    """Make an episode of an interrupted partial folder, or complete a change; return what was done."""
+    try:
+        number = finalise(layout, partial, recovered=True)
+    except OSError:
+        raise
+    except Exception as error:
+        why = str(error) if isinstance(error, DatasetError) else f"{type(error).__name__}: {error}"
+        raise HalError(
+            f"{partial} cannot be made an episode ({why}); move it elsewhere and retry", code="damaged_episode"
+        ) from error
+    if partial == layout.change:
+        return f"a change of episodes was interrupted: {'it was not begun' if number is None else 'completed'}"
+    if number is None:
+        return f"{partial.name} held no whole row and was removed"
+    return f"{partial.name} was not finished: recovered as episode {number}"
 
 
 def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[tuple[str, str]]:
@@ -307,7 +331,11 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         for name in camera.depths:
             made.append((rest.folder / f"{name}.depth", layout.depth(name, number)))
     place, entries = _continued(layout, closed, place, start, fps, stats)
-    write_json(final / "about.json", closed | place.as_json())
+    own, name, common = split_about(closed | place.as_json())
+    if not layout.common(name).exists():
+        write_json(final / "common.json", common)
+        made.append((final / "common.json", layout.common(name)))
+    write_json(final / "about.json", own, indent=None)
     made.append((final / "about.json", layout.about(number)))
 
     write_table(final / "entry.parquet", entries)
@@ -410,153 +438,6 @@ def _pace(rest: LiveContent) -> dict[str, float]:
     for row in rest.rows:
         pace.add(row)
     return pace.as_json()
-
-
-# Recovery.
-
-
-def recover(out: str | Path) -> list[str]:
-    """Finish every interrupted episode of the dataset in the folder ``out``.
-
-    Such an episode ends with its last complete row. It keeps the mark that was given; without one, ``success`` is
-    None.
-
-    Returns:
-        What was done, a line per episode.
-
-    Raises:
-        DriverMissing: A library is not installed.
-        CommandError: There is no such folder (code ``no_folder``), or another program is recording into it
-            (``dataset_locked``).
-        DatasetError: The dataset's index is missing or damaged; see :func:`repair`.
-        HalError: An unfinished episode is damaged (code ``damaged_episode``).
-        OSError: The disk refuses.
-    """
-    layout = _layout(out)
-    if not layout.episodes.is_dir():
-        return []
-    with lock_dataset(layout):
-        return recover_all(layout)
-
-
-def repair(out: str | Path) -> list[str]:
-    """Rebuild the index of the dataset in the folder ``out`` if it does not match the episodes, then recover it.
-
-    The index is all of ``meta/``. It is rebuilt from ``episodes/``, ``data/`` and ``videos/``, which are only read.
-    Arguments, return value and errors are those of :func:`recover`; DatasetError names the file of an episode without
-    which the index cannot be rebuilt.
-    """
-    layout = _layout(out)
-    if not layout.episodes.is_dir():
-        raise DatasetError(
-            f"{layout.root} has no folder episodes: there is no recording of this program to repair",
-            code="foreign_dataset",
-        )
-    with lock_dataset(layout):
-        done = [_finished(layout, partial) for partial in layout.interrupted]
-        if (wrong := next(check_index(layout), None)) is not None:
-            count = _rebuild(layout)
-            done.append(f"the index was rebuilt from {count} episode{'' if count == 1 else 's'}; it was wrong: {wrong}")
-            for left in check_index(layout):
-                raise left
-        return done + recover_all(layout)
-
-
-def recover_all(layout: DatasetLayout) -> list[str]:
-    """Do the same as :func:`recover`, for a dataset that is locked already."""
-    layout.sweep()
-    done = [_finished(layout, partial) for partial in layout.interrupted]
-    if layout.partials():
-        read_index(layout)
-    return done + [_finished(layout, partial) for partial in layout.partials()]
-
-
-def _finished(layout: DatasetLayout, partial: Path) -> str:
-    try:
-        number = finalise(layout, partial, recovered=True)
-    except OSError:
-        raise
-    except Exception as error:
-        why = str(error) if isinstance(error, DatasetError) else f"{type(error).__name__}: {error}"
-        raise HalError(
-            f"{partial} cannot be made an episode ({why}); move it elsewhere and retry", code="damaged_episode"
-        ) from error
-    if number is None:
-        return f"{partial.name} held no whole row and was removed"
-    return f"{partial.name} was not finished: recovered as episode {number}"
-
-
-def _layout(out: str | Path) -> DatasetLayout:
-    require_libraries()
-    finish_replacement(out)
-    layout = DatasetLayout(out)
-    if not layout.root.is_dir():
-        raise CommandError(f"there is no folder {layout.root}", code="no_folder")
-    return layout
-
-
-# The index.
-
-
-def _rebuild(layout: DatasetLayout) -> int:
-    """Write all of ``meta/`` again from the episodes, ``info.json`` last. Return the number of episodes."""
-    count = max(layout.numbers(), default=-1) + 1
-    info = _info(layout, count)
-    episodes = [Episode(layout, number, info) for number in range(count)]
-    places = [(episode.number, episode.place) for episode in episodes]
-    strays = stray_files(layout, places, video_names(info["features"]))
-    for path in strays:
-        if not path.is_relative_to(layout.info.parent):
-            raise DatasetError("belongs to no episode in episodes/", file=str(path.relative_to(layout.root)))
-    tasks: dict[int, str] = {}
-    parts: dict[str, list[Stats]] = {}
-    entries: dict[int, list[dict[str, Any]]] = {}
-    start = 0
-    for episode in episodes:
-        check_rows(episode, start)
-        task = tasks.setdefault(int(episode.columns["task_index"][0]), episode.task)
-        if task != episode.task:
-            raise DatasetError(f"the task is {episode.task!r}, and {task!r} in other episodes", episode=episode.number)
-        stats = stats_of(episode)
-        about = episode.info | {"episode": episode.number}
-        row = entry_row(about, episode.place, start, episode.fps, stats)
-        entries.setdefault(episode.place.entry, []).append(row)
-        for key, found in stats.items():
-            parts.setdefault(key, []).append(found)
-        start += episode.length
-    for file, rows in entries.items():
-        write_table(layout.entry(file), entries_table(rows))
-    for path in strays:  # files of an earlier index, which LeRobot would read
-        path.unlink()
-    if sorted(tasks) != list(range(len(tasks))):
-        raise DatasetError(f"the episodes have tasks of the numbers {sorted(tasks)}", file="data")
-    write_table(layout.tasks, tasks_table([tasks[k] for k in sorted(tasks)]), keep_schema=True)
-    write_json(layout.stats, stats_as_lists({key: merge_stats(found) for key, found in parts.items()}))
-    counts = {"total_episodes": count, "total_frames": start, "total_tasks": len(tasks)}
-    write_json(layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
-    return count
-
-
-def _info(layout: DatasetLayout, count: int) -> dict[str, Any]:
-    """Return ``meta/info.json`` with the columns that all episodes have; its counts are not up to date."""
-    if count == 0:
-        raise DatasetError("there is no episode from which the index could be rebuilt", file="episodes")
-    abouts = [read_about(layout, number) for number in range(count)]
-    kept = [(about["features"], about["fps"], about["robot_type"]) for about in abouts if "features" in about]
-    for number, other in enumerate(kept):
-        if other != kept[0]:
-            raise DatasetError("has other columns than episode 0", file=f"episodes/{number:06d}.json", episode=number)
-    if kept:
-        return new_info(*kept[0])
-    try:
-        with dataset_errors(layout.root, layout.info):
-            return validated_info(read_json(layout.info))
-    except DatasetError as error:
-        raise DatasetError(
-            "was recorded by an older version, which kept the names of the columns in meta/info.json only; copy that "
-            "file from a dataset that was recorded with the same rig, and repair again",
-            file="episodes/000000.json",
-        ) from error
 
 
 def stats_of(episode: Episode) -> dict[str, Stats]:

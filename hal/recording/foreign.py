@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import DatasetError
-from .index import dataset_errors, read_tasks, validated_info
+from .index import read_tasks, validated_info
 from .layout import CHUNK, GRID, MORE_STREAMS, DatasetLayout, current_key, read_json, video_key
+from .validation import dataset_errors
 
 __all__ = ["ForeignDataset", "is_foreign", "read_foreign"]
 

@@ -2,67 +2,40 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import shlex
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from numpy.typing import NDArray
+from pydantic import Field
 
-from ..errors import DatasetError, HalError
+from ..errors import DatasetError
+from .about import read_about
+from .codecs import Stats, merge_stacked, merge_stats
 from .layout import CHUNK, DatasetLayout, EpisodePlace, read_json, video_names
+from .validation import CameraName, Feature, Model, dataset_errors
 
 __all__ = [
-    "CameraName",
     "check_next_episode",
-    "checked_name",
+    "merged_stats",
     "next_place",
-    "read_about",
     "read_entries",
     "read_index",
+    "read_stats",
+    "read_table",
     "read_tasks",
-    "dataset_errors",
     "repair_command",
+    "stats_parts",
     "stray_files",
     "validated_info",
 ]
 
-_SIDE = 16384
-"""Pixels; no picture is larger."""
-_DISK_REFUSES = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 _TASK = "__index_level_0__"
 """LeRobot's name of the column of texts in ``meta/tasks.parquet``."""
 
 
-def checked_name(name: str) -> str:
-    """Return ``name``, a part of a file name. Raises ValueError for one that would lead to another folder."""
-    if not name or "/" in name or "\0" in name or name in (".", ".."):
-        raise ValueError("must be a name without slashes")
-    return name
-
-
-CameraName = Annotated[str, AfterValidator(checked_name)]
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(strict=True, extra="ignore")
-
-
-class _Feature(_Model):
-    dtype: str
-    shape: list[Annotated[int, Field(ge=1, le=_SIDE)]]
-    names: list[str] | None = None
-
-    @model_validator(mode="after")
-    def _has_a_name_per_number(self) -> _Feature:
-        if self.dtype != "video" and self.names is not None and [len(self.names)] != self.shape:
-            raise ValueError(f"{len(self.names)} names for the shape {self.shape}")
-        return self
-
-
-class _Info(_Model):
+class _Info(Model):
     """The keys of ``meta/info.json`` that are used here."""
 
     codebase_version: str
@@ -70,79 +43,7 @@ class _Info(_Model):
     robot_type: str | None = None
     total_episodes: Annotated[int, Field(ge=0, le=CHUNK * CHUNK)]
     total_frames: Annotated[int, Field(ge=0)]
-    features: dict[CameraName, _Feature]
-
-
-class _Camera(_Model):
-    K: Annotated[list[Annotated[list[float], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)]
-    distortion: list[float]
-    depth_unit_m: Annotated[FiniteFloat, Field(gt=0)] | None = None
-    streams: list[str] = []
-
-
-class _World(_Model):
-    driver: str
-
-
-class _Robot(_Model):
-    name: str
-    model: str
-    driver: str
-    base_position: Annotated[list[float], Field(min_length=3, max_length=3)]
-    base_orientation: Annotated[list[float], Field(min_length=4, max_length=4)]
-
-
-class _View(_Model):
-    robot: str | None = None
-
-
-class _RigCamera(_Model):
-    name: str
-    view: _View | None = None
-
-
-class _Resolved(_Model):
-    world: _World | None = None
-    robots: list[_Robot] = []
-    cameras: list[_RigCamera] = []
-
-
-class _Rig(_Model):
-    resolved: _Resolved
-
-
-_At = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
-
-
-class _Files(_Model):
-    index: Annotated[int, Field(ge=0)]
-    data: _At
-    videos: dict[CameraName, _At]
-
-
-class _About(_Model):
-    """The keys of ``episodes/N.json`` that are used here."""
-
-    length: Annotated[int, Field(ge=1)]
-    t_start: FiniteFloat
-    task: str
-    success: bool | None
-    cameras: dict[CameraName, _Camera]
-    rig: _Rig
-    dropped: int | None = None
-    gaps: list[Any] = []
-    trouble: str | None = None
-    recovered: bool = False
-    pace: dict[str, float] = {}
-    info: dict[str, Any] = {}
-    seed: int | None = None
-    started: str | None = None
-    fps: Annotated[int, Field(ge=1, le=1000)] | None = None
-    robot_type: str | None = None
-    clock: Literal["real_time", "lock_step"] | None = None
-    files: _Files | None = None
-    features: dict[CameraName, _Feature] | None = None
-    """Missing in episodes of older versions."""
+    features: dict[CameraName, Feature]
 
 
 def repair_command(layout: DatasetLayout) -> str:
@@ -150,42 +51,11 @@ def repair_command(layout: DatasetLayout) -> str:
     return f"hal review {shlex.quote(str(layout.root))} --repair"
 
 
-@contextlib.contextmanager
-def dataset_errors(root: Path, path: Path, episode: int | None = None) -> Iterator[None]:
-    """Raise any error of a missing or damaged file as a DatasetError that names the file and the episode.
-
-    A disk that refuses what is written meanwhile is no damage: its OSError is raised as it is.
-    """
-    try:
-        yield
-    except HalError:
-        raise
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno in _DISK_REFUSES:
-            raise
-        file = str(path.relative_to(root)) if path.is_relative_to(root) else str(path)
-        raise DatasetError(_reason(error), file=file, episode=episode) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, FileNotFoundError):
-        return "is missing"
-    if isinstance(error, ValidationError):
-        first = error.errors(include_url=False, include_input=False)[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    text = (str(error).splitlines() or [""])[0][:200]
-    return f"cannot be read: {text or type(error).__name__}"
-
-
-def _validated(model: type[BaseModel], data: Any) -> dict[str, Any]:
-    model.model_validate(data)
-    found: dict[str, Any] = data
-    return found
-
-
 def validated_info(data: Any) -> dict[str, Any]:
     """Return ``data`` if it is a valid ``meta/info.json``. Raises pydantic's ValidationError."""
-    return _validated(_Info, data)
+    _Info.model_validate(data)
+    found: dict[str, Any] = data
+    return found
 
 
 def read_index(layout: DatasetLayout) -> dict[str, Any] | None:
@@ -265,20 +135,69 @@ def stray_files(
     return [path for path in layout.finished() if path not in known]
 
 
-def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:
-    """Return ``episodes/N.json`` of an episode. Raises DatasetError."""
-    path = layout.about(number)
-    with dataset_errors(layout.root, path, number):
-        return _validated(_About, read_json(path))
-
-
-def read_entries(path: Path, *, stats: bool) -> dict[int, dict[str, Any]]:
-    """Return the rows of a file of ``meta/episodes`` by the number of the episode, with or without the statistics."""
+def read_entries(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the rows of a file of ``meta/episodes`` by the number of the episode, without the statistics."""
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
-    names = [name for name in file.schema_arrow.names if stats or not name.startswith("stats/")]
+    names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
     return {row["episode_index"]: row for row in file.read(columns=names).to_pylist()}
+
+
+def read_table(path: Path) -> Any:
+    """Return a file of ``meta/episodes`` as an Arrow table."""
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as file:
+        return file.read(use_threads=False)
+
+
+def read_stats(table: Any, keys: Collection[str] | None = None) -> dict[str, dict[str, NDArray[Any]]]:
+    """Return the statistics in a file of ``meta/episodes``, by column or video and by name, each (episodes, ...).
+
+    Args:
+        table: The file's content as an Arrow table.
+        keys: Columns and videos; None for all.
+    """
+    found: dict[str, dict[str, NDArray[Any]]] = {}
+    for name in table.column_names:
+        if name.startswith("stats/") and (keys is None or name.split("/")[1] in keys):
+            _, key, what = name.split("/")
+            values, shape = table[name].combine_chunks(), [len(table)]
+            while hasattr(values, "flatten"):
+                size, values = len(values), values.flatten()
+                shape.append(len(values) // size)
+            found.setdefault(key, {})[what] = values.to_numpy(zero_copy_only=False).reshape(shape)
+    return found
+
+
+def stats_parts(
+    layout: DatasetLayout, keys: Collection[str] | None = None, known: Mapping[Path, Any] | None = None
+) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
+    """Yield the statistics of each column and video in each file of ``meta/episodes``, as :func:`read_stats` does.
+
+    Args:
+        layout: The dataset.
+        keys: Columns and videos; None for all.
+        known: Content of files to use instead of those on the disk.
+
+    Raises:
+        DatasetError: A file is damaged.
+    """
+    for path in sorted(layout.entry(0).parent.parent.glob("*/*.parquet")):
+        with dataset_errors(layout.root, path):
+            table = known[path] if known and path in known else read_table(path)
+            yield from read_stats(table, keys).items()
+
+
+def merged_stats(
+    layout: DatasetLayout, keys: Collection[str] | None = None, known: Mapping[Path, Any] | None = None
+) -> dict[str, Stats]:
+    """Return the statistics over all episodes; arguments and errors are those of :func:`stats_parts`."""
+    parts: dict[str, list[Stats]] = {}
+    for key, found in stats_parts(layout, keys, known):
+        parts.setdefault(key, []).append(merge_stacked(found))
+    return {key: merge_stats(found) for key, found in parts.items()}
 
 
 def read_tasks(path: Path) -> list[str]:

@@ -72,9 +72,9 @@ policy must not learn from, because it contains the answer or is unknown on a ro
 GRIP_FORCE = "rig.setpoint_force"
 """Force that was asked of each gripper, N."""
 TAU_EXT, WRENCH_EXT = "rig.tau_ext", "rig.wrench_ext"
+"""External torques, Nm, and the external wrench at the tcp, N and Nm, as the arm estimates them."""
 ENVIRONMENT = "observation.environment_state"
 """LeRobot's key for what a policy sees of the world beside the robot: here the poses of objects."""
-"""External torques, Nm, and the external wrench at the tcp, N and Nm, as the arm estimates them."""
 PAD = "rig.pad"
 SUCCESS = "next.success"
 SOURCE = "source"
@@ -300,13 +300,32 @@ class DatasetLayout:
         """Return the path of an episode's metadata."""
         return self.episodes / f"{number:06d}.json"
 
+    def common(self, name: str) -> Path:
+        """Return the path of metadata that several episodes have in common, by its name."""
+        return self.episodes / f"{name}.json"
+
+    def commons(self) -> Iterator[Path]:
+        """Yield every file of metadata that episodes have in common."""
+        return self.episodes.glob("common-*.json")
+
     def partial(self, number: int) -> Path:
         """Return the folder of an episode that is not part of the dataset yet."""
         return self.episodes / f"{number:06d}.partial"
 
+    @property
+    def change(self) -> Path:
+        """The partial folder of a change of finished episodes (:mod:`~hal.recording.changing`)."""
+        return self.episodes / "change.partial"
+
     def partials(self) -> list[Path]:
         """Return all partial folders, oldest first."""
-        return sorted(self.episodes.glob("*.partial"))
+        return sorted(self._folders(".partial"))
+
+    def _folders(self, ending: str) -> list[Path]:
+        """Return what is in ``episodes/`` with this ending; far quicker than glob among 10,000 episodes."""
+        with contextlib.suppress(FileNotFoundError):
+            return [self.episodes / name for name in os.listdir(self.episodes) if name.endswith(ending)]
+        return []
 
     @property
     def interrupted(self) -> list[Path]:
@@ -363,7 +382,7 @@ class DatasetLayout:
 
     def sweep(self) -> None:
         """Remove folders whose removal was interrupted."""
-        for gone in self.episodes.glob("*.removed"):
+        for gone in self._folders(".removed"):
             shutil.rmtree(gone, ignore_errors=True)
 
 
@@ -548,12 +567,12 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: Any, indent: int | None = 1) -> None:
     """Write a JSON file, whole or not at all. Numbers that are not finite become null: JSON has no NaN."""
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
     with beside.open("x", encoding="utf-8") as file:
-        file.write(json.dumps(_finite(data), indent=1, default=str, allow_nan=False) + "\n")
+        file.write(json.dumps(_finite(data), indent=indent, default=str, allow_nan=False) + "\n")
     sync_to_disk(beside)
     beside.replace(path)
     sync_to_disk(path.parent)

@@ -24,19 +24,10 @@ from numpy.typing import DTypeLike, NDArray
 from ..host.memory import Mailbox
 from ..host.ring import ArrayRing, Images
 from ..types import STREAMS
-from .codecs import (
-    DepthFile,
-    DepthReader,
-    VideoEncoder,
-    VideoFile,
-    as_rgb,
-    count_frames,
-    ids_to_units,
-    truncate_records,
-    truncate_to_last_fragment,
-)
-from .index import checked_name
+from .codecs import DepthFile, DepthReader, ids_to_units, truncate_records
 from .layout import MORE_STREAMS, SEGMENTATION, CameraSetup, read_json, sync_to_disk, write_json
+from .validation import checked_name
+from .videos import VideoEncoder, VideoFile, as_rgb, count_frames, truncate_to_last_fragment
 
 __all__ = [
     "ABOUT",

@@ -1,4 +1,4 @@
-"""Merge datasets that were recorded with the same rig into one, and curate a dataset: delete, extract, mark, re-task.
+"""Merge datasets that were recorded with the same rig into one, and curate a dataset: delete, extract, re-task.
 
 Rows are renumbered, statistics are combined from those of the episodes, and small videos are joined. Large videos,
 depth files and rows that stay as they are become hard links to those of the parts. Nothing is encoded again.
@@ -7,79 +7,41 @@ depth files and rows that stay as they are become hard links to those of the par
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
-import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
-from itertools import accumulate
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from ..errors import CommandError, DatasetError
+from .building import DatasetBuilder, EpisodeLabel, EpisodeSource, link_file
+from .changing import existing_episodes, refuse_foreign
 from .checking import format_differences
-from .codecs import (
-    Stats,
-    VideoPart,
-    can_be_joined,
-    column_stats,
-    copy_records,
-    join_videos,
-    merge_stats,
-    stats_as_lists,
-)
 from .dataset import Dataset, Episode
-from .finish import entries_table, entry_row, last_row, new_info, stats_of, tasks_table, write_table
-from .foreign import is_foreign
-from .index import check_next_episode, dataset_errors, read_entries, read_tasks, stray_files
+from .index import check_next_episode, stray_files
 from .layout import (
     CHUNK,
     GROUP,
-    VIDEO_MB,
     DatasetLayout,
-    EpisodePlace,
     building_folder,
     finish_replacement,
     lock_dataset,
     put_in_place,
     require_libraries,
     video_names,
-    write_json,
 )
 
 __all__ = [
     "EpisodeLabel",
     "delete_episodes",
-    "existing_episodes",
     "extract",
     "finish_replacement",
-    "mark_episodes",
     "merge",
     "pack",
     "set_task",
 ]
 
 _LOG = logging.getLogger("hal.recording")
-_THREADS = 4
-
-
-class EpisodeLabel(NamedTuple):
-    """What can be changed about a recorded episode."""
-
-    task: str
-    success: bool | None
-    """Whether it is marked a success; None for no mark."""
-
-
-class _Source(NamedTuple):
-    dataset: Dataset
-    episode: Episode
-    label: EpisodeLabel
 
 
 def merge(
@@ -129,16 +91,11 @@ def merge(
         for layout in {layout.root: layout for layout in layouts}.values():
             if not layout.root.is_dir():
                 raise CommandError(f"there is no folder {layout.root}", code="no_folder")
-            if is_foreign(layout):
-                raise CommandError(
-                    f"{layout.root} was edited or recorded by another program, and has no episodes/; it can be read "
-                    "and exported, and LeRobot's own tools edit it",
-                    code="foreign_dataset",
-                )
+            refuse_foreign(layout)
             locks.enter_context(lock_dataset(layout, only_read=not (replaces and layout.root == target.root)))
             if layout.partials():
                 raise CommandError(
-                    f"{layout.root} has an unfinished episode; finish it first, with recover()",
+                    f"{layout.root} has an unfinished episode or change; finish it first, with recover()",
                     code="unfinished_episodes",
                 )
         for part in parts:
@@ -148,7 +105,7 @@ def merge(
                 )
         sources = _sources(layouts, key, label or _label, view)
         building = locks.enter_context(building_folder(target, "merging"))
-        _Builder(building, sources).build(on_episode)
+        DatasetBuilder(building, sources).build(on_episode)
         if replaces:
             _keep_other_files(target, building)
         os.sync()  # the parts may be removed next
@@ -163,7 +120,7 @@ def _keep_other_files(old: DatasetLayout, new: DatasetLayout) -> None:
         raise error
 
     old.sweep()
-    own = {*old.finished(), old.info, old.stats, old.tasks, old.episodes / ".lock"}
+    own = {*old.finished(), *old.commons(), old.info, old.stats, old.tasks, old.episodes / ".lock"}
     for folder, folders, files in os.walk(old.root, onerror=refuse):
         links = [name for name in folders if Path(folder, name).is_symlink()]
         for path in (Path(folder, name) for name in (*files, *links)):
@@ -174,7 +131,7 @@ def _keep_other_files(old: DatasetLayout, new: DatasetLayout) -> None:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.symlink_to(path.readlink())
             else:
-                _link(path, target)
+                link_file(path, target)
 
 
 def extract(dataset: str | Path | Dataset, episodes: Collection[int], out: str | Path) -> int:
@@ -218,17 +175,6 @@ def set_task(dataset: str | Path | Dataset, task: str, episodes: Collection[int]
         [opened],
         opened.root,
         label=lambda episode: EpisodeLabel(task, episode.success) if episode.number in chosen else _label(episode),
-    )
-
-
-def mark_episodes(dataset: str | Path | Dataset, marks: Mapping[int, bool | None]) -> None:
-    """Mark episodes as a success (True), a failure (False) or neither (None). Raises as :func:`extract`."""
-    opened = open_dataset(dataset)
-    existing_episodes(opened, marks)
-    merge(
-        [opened],
-        opened.root,
-        label=lambda episode: EpisodeLabel(episode.task, marks.get(episode.number, episode.success)),
     )
 
 
@@ -280,24 +226,12 @@ def open_dataset(dataset: str | Path | Dataset) -> Dataset:
     return dataset if isinstance(dataset, Dataset) else Dataset(dataset)
 
 
-def existing_episodes(dataset: Dataset, episodes: Collection[int]) -> frozenset[int]:
-    """Return the numbers of episodes, all of which exist."""
-    count = len(dataset)
-    if unknown := sorted(set(episodes) - set(range(count))):
-        raise CommandError(
-            f"there is no episode {unknown[0]} in {dataset.root}; there are {count}, from 0 on", code="no_episodes"
-        )
-    if not episodes:
-        raise CommandError("no episode was selected", code="no_episodes")
-    return frozenset(episodes)
-
-
 def _sources(
     layouts: Sequence[DatasetLayout],
     key: Callable[[Episode], Any] | None,
     label: Callable[[Episode], EpisodeLabel | None],
     view: Callable[[Episode], Episode],
-) -> list[_Source]:
+) -> list[EpisodeSource]:
     """Return the episodes of all parts, in the order of the result. Raises CommandError if their formats differ."""
     datasets = [Dataset(layout.root) for layout in layouts]
     for layout, dataset in zip(layouts, datasets, strict=True):
@@ -314,7 +248,7 @@ def _sources(
                 code="other_dataset",
             )
     sources = [
-        _Source(dataset, view(episode), new)
+        EpisodeSource(dataset, view(episode), new)
         for dataset in datasets
         for episode in dataset.episodes
         if (new := label(episode)) is not None
@@ -322,7 +256,7 @@ def _sources(
     if not sources:
         raise CommandError("no episode would be left: remove the folder instead", code="no_episodes")
     if key is not None:
-        first: dict[Any, _Source] = {}
+        first: dict[Any, EpisodeSource] = {}
         for source in sources:
             first.setdefault(key(source.episode), source)
         sources = [first[value] for value in sorted(first)]
@@ -338,246 +272,3 @@ def _camera_differences(one: Dataset, other: Dataset) -> list[str]:
         for info in (one.episodes[0].info["cameras"], other.episodes[0].info["cameras"])
     )
     return [] if there == here else [f"depth and streams are {there} there, and {here} here"]
-
-
-class _Builder:
-    """Writes a dataset of episodes of other ones: file by file, each a link where it stays as it is."""
-
-    def __init__(self, layout: DatasetLayout, sources: Sequence[_Source]) -> None:
-        self.layout, self.sources = layout, sources
-        self.features: dict[str, Any] = sources[0].episode._meta["features"]
-        self.fps = sources[0].episode.fps
-        self.tasks = list(dict.fromkeys(source.label.task for source in sources))
-        self.starts = [0, *accumulate(source.episode.length for source in sources)]
-        """Number of each episode's first row in the whole dataset; then of all rows."""
-        self._entries = lru_cache(maxsize=2 * _THREADS)(partial(read_entries, stats=True))
-        self._tasks = lru_cache(maxsize=None)(read_tasks)
-        self._places: dict[str, list[tuple[int, int]]] = {}
-        """File of each video of each episode, and the number of its first picture there."""
-
-    def build(self, on_episode: Callable[[int, int], object]) -> None:
-        """Write everything, ``info.json`` last."""
-        count = len(self.sources)
-        parts: dict[str, list[Stats]] = {}
-        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:  # the libraries release the lock
-            try:
-                names = video_names(self.features)
-                self._places = dict(zip(names, pool.map(self._join_videos, names), strict=True))
-                done = 0
-                for found in pool.map(self._add_group, range(0, count, GROUP)):
-                    for key in found[0]:
-                        parts.setdefault(key, []).append(merge_stats([stats[key] for stats in found]))
-                    for _ in found:
-                        done += 1
-                        on_episode(done, count)
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-        write_table(self.layout.tasks, tasks_table(self.tasks), keep_schema=True)
-        write_json(self.layout.stats, stats_as_lists({key: merge_stats(found) for key, found in parts.items()}))
-        info = new_info(self.features, self.fps, self.sources[0].episode._meta["robot_type"])
-        counts = {"total_episodes": count, "total_frames": self.starts[-1], "total_tasks": len(self.tasks)}
-        write_json(self.layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
-
-    # Videos.
-
-    def _join_videos(self, name: str) -> list[tuple[int, int]]:
-        """Write the files of one video; return the file of each episode, and its first picture there.
-
-        A file becomes a link if all of it is used and it is large; others are joined, up to :data:`VIDEO_MB`.
-        """
-        files: list[list[_Run]] = []
-        for run in self._runs(name):
-            if files and _fits(files[-1], run):
-                files[-1].append(run)
-            else:
-                files.append([run])
-        for number, runs in enumerate(files):
-            target = self.layout.video(name, number)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if len(runs) == 1 and runs[0].whole:
-                _link(runs[0].part.path, target)
-            else:
-                with dataset_errors(self.layout.root, runs[0].part.path):
-                    join_videos([run.part for run in runs], target, self.fps)
-        places, file, first = [], 0, 0
-        sizes = [sum(run.part.length for run in runs) for runs in files]
-        for source in self.sources:
-            if first == sizes[file]:
-                file, first = file + 1, 0
-            places.append((file, first))
-            first += source.episode.length
-        return places
-
-    def _runs(self, name: str) -> list[_Run]:
-        """Return the pictures of all episodes; those that follow each other in a file already are one part."""
-        pictures: dict[Path, int] = {}
-        for dataset in {source.dataset.root: source.dataset for source in self.sources}.values():
-            for episode in dataset.episodes:
-                path = episode._layout.video(name, episode.place.video(name)[0])
-                pictures[path] = pictures.get(path, 0) + episode.length
-        parts: list[VideoPart] = []
-        for _, episode, _ in self.sources:
-            file, first = episode.place.video(name)
-            path = episode._layout.video(name, file)
-            with dataset_errors(episode._layout.root, path, episode.number):
-                path.stat()
-            last = parts[-1] if parts else None
-            if last is not None and (last.path, last.first + last.length) == (path, first):
-                parts[-1] = last._replace(length=last.length + episode.length)
-            else:
-                parts.append(VideoPart(path, first, episode.length))
-        return [
-            _Run(part, part.path.stat().st_size * part.length / pictures[part.path], part.length == pictures[part.path])
-            for part in parts
-        ]
-
-    # Rows, index, metadata and depth.
-
-    def _add_group(self, begin: int) -> list[dict[str, Any]]:
-        """Write the files of :data:`GROUP` episodes, but not their videos; return their statistics."""
-        group, numbers = begin // GROUP, range(begin, min(begin + GROUP, len(self.sources)))
-        data = self.layout.data(group)
-        data.parent.mkdir(parents=True, exist_ok=True)
-        kept = self._kept_rows(numbers)
-        if kept is not None:
-            with dataset_errors(self.sources[begin].dataset.root, kept):
-                _link(kept, data)
-        else:
-            self._write_rows(data, numbers)
-        found, rows = [], []
-        for number in numbers:
-            _, episode, label = self.sources[number]
-            stats = self._stats(number)
-            if kept is None:
-                stats |= {key: column_stats(values[:, None]) for key, values in self._changed(number).items()}
-            first = self.starts[number] - self.starts[begin]
-            place = EpisodePlace(group, (group, first), {name: at[number] for name, at in self._places.items()})
-            about = episode.info | {"episode": number} | label._asdict() | place.as_json()
-            if about == episode.info and episode.rows is None:
-                _link(episode._layout.about(number), self.layout.about(number))
-            else:
-                self.layout.about(number).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-            for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
-                if path.suffix == ".depth":
-                    with dataset_errors(episode._layout.root, path, episode.number):
-                        target = self.layout.depth(path.parent.parent.name, number)
-                        if episode.rows is None:
-                            _link(path, target)
-                        else:
-                            copy_records(path, target, *episode.rows)
-            rows.append(entry_row(about, place, self.starts[number], self.fps, stats))
-            found.append(stats)
-        write_table(self.layout.entry(group), entries_table(rows))
-        return found
-
-    def _entry(self, number: int) -> dict[str, Any]:
-        """Return the row of an episode of the result in the index of its part."""
-        episode = self.sources[number].episode
-        path = episode._layout.entry(episode.place.entry)
-        with dataset_errors(episode._layout.root, path, episode.number):
-            return self._entries(path)[episode.number]
-
-    def _changed(self, number: int) -> dict[str, NDArray[Any]]:
-        """Return the columns (rows,) of an episode that depend on its number and its label."""
-        _, episode, label = self.sources[number]
-        rows = episode.length
-        found = {
-            "episode_index": np.full(rows, number),
-            "index": np.arange(self.starts[number], self.starts[number] + rows),
-            "task_index": np.full(rows, self.tasks.index(label.task)),
-            "next.success": last_row(rows, label.success is True)[:, 0],
-        }
-        return {key: values for key, values in found.items() if key in self.features}
-
-    def _stats(self, number: int) -> dict[str, Any]:
-        """Return the statistics of an episode's columns and videos as its part's index has them."""
-        episode = self.sources[number].episode
-        if episode.rows is not None:
-            return dict(stats_of(episode))
-        stats: dict[str, Any] = {}
-        for name, value in self._entry(number).items():
-            if name.startswith("stats/"):
-                _, key, what = name.split("/")
-                stats.setdefault(key, {})[what] = value
-        if missing := [key for key in self.features if key not in stats]:
-            file = episode._layout.entry(episode.place.entry).relative_to(episode._layout.root)
-            raise DatasetError(f"has no statistics of {', '.join(missing)}", file=str(file), episode=episode.number)
-        return stats
-
-    def _kept_rows(self, numbers: range) -> Path | None:
-        """Return the file that holds the rows of just these episodes as they are to be; None if there is none."""
-        first = self.sources[numbers[0]].episode
-        path, end = first._layout.data(first.place.data[0]), 0
-        for number in numbers:
-            _, episode, label = self.sources[number]
-            entry = self._entry(number)
-            with dataset_errors(episode._layout.root, episode._layout.tasks):
-                known = self._tasks(episode._layout.tasks)
-            if (
-                episode.rows is not None
-                or episode._layout.data(episode.place.data[0]) != path
-                or episode.place.data[1] != end
-                or (episode.number, entry["dataset_from_index"]) != (number, self.starts[number])
-                or entry["tasks"] != [label.task]
-                or known.index(label.task) != self.tasks.index(label.task)
-                or ("next.success" in self.features and (entry.get("success") is True) != (label.success is True))
-            ):
-                return None
-            end += episode.length
-        sharing = [
-            each for each in self.sources[numbers[0]].dataset.episodes if each.place.data[0] == first.place.data[0]
-        ]
-        return path if len(sharing) == len(numbers) else None
-
-    def _write_rows(self, path: Path, numbers: range) -> None:
-        """Write the rows of some episodes with their new numbers, each as a row group of its own."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        with contextlib.ExitStack() as stack:
-            file: Any = None
-            for number in numbers:
-                episode = self.sources[number].episode
-                table = episode.read_table().replace_schema_metadata()
-                with dataset_errors(episode._layout.root, episode._layout.root / episode.data_file, episode.number):
-                    for key, values in self._changed(number).items():
-                        table = table.set_column(table.schema.get_field_index(key), key, pa.array(values))
-                    if file is None:
-                        file = stack.enter_context(pq.ParquetWriter(path, table.schema, write_page_checksum=True))
-                    file.write_table(table.cast(file.schema), row_group_size=len(table))
-
-
-class _Run(NamedTuple):
-    """Pictures of episodes that follow each other in one file."""
-
-    part: VideoPart
-    size: float
-    """Bytes."""
-    whole: bool
-    """Whether they are all of the file's pictures."""
-
-
-def _fits(file: Sequence[_Run], run: _Run) -> bool:
-    """Return whether a run is to be joined to a file; a large file stays as it is, because copying it takes time."""
-    limit = VIDEO_MB * 1e6
-    if sum(each.size for each in (*file, run)) > limit or any(
-        each.whole and each.size > limit / 2 for each in (file[0], run)
-    ):
-        return False
-    return can_be_joined(file[0].part.path, run.part.path)
-
-
-def _link(source: Path, target: Path) -> None:
-    """Make a hard link, or a copy on a file system that has none or is another one.
-
-    Raises FileExistsError and changes nothing if ``target`` exists: it may be a link to a file of another dataset.
-    """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except (FileNotFoundError, FileExistsError):
-        raise
-    except OSError:
-        with source.open("rb") as read, target.open("xb") as write:
-            shutil.copyfileobj(read, write, 1 << 20)

@@ -18,7 +18,6 @@ from ..host.hosts import make_groups
 from ..host.process import Child, SharedMemory
 from ..learning.episode import stands_in_world
 from .checking import check_compatible, known_columns
-from .codecs import VideoEncoder
 from .finish import write_mark
 from .index import read_index
 from .layout import DatasetLayout, features_of, lock_dataset, require_libraries
@@ -27,6 +26,7 @@ from .merging import pack_if_loose
 from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
 from .sample_clock import LockStepSampleClock, RealTimeSampleClock, SampleClock
 from .sampling import CameraBuffer, RowSampler, select_devices
+from .videos import VideoEncoder
 
 if TYPE_CHECKING:
     from ..rig import Rig

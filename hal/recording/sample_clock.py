@@ -129,7 +129,7 @@ class LockStepSampleClock(SampleClock):
     def start(self) -> None:
         self._make_row()
         if self._wanted:
-            self._detach = self._stepped.every(self._period, self._make_row)
+            self._detach = self._stepped.call_every(self._period, self._make_row)
 
     def end(self) -> None:
         self._wanted = False

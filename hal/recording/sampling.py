@@ -102,7 +102,7 @@ class CameraBuffer:
         if not self._lock_step:  # before the first picture, so that neither a frame nor a loss is missed
             self._detach = [self.camera.on_frame(self._add_frame), self.camera.on_connection(self._mark_lost)]
         try:
-            first = self.camera.latest(max_age=_SILENT)
+            first = self.camera.read_latest(max_age=_SILENT)
         except StaleStateError:
             first = self.camera.read(timeout=_FIRST_PICTURE, after=self.camera.clock.now() - _SILENT)
         with self._lock:
@@ -134,7 +134,7 @@ class CameraBuffer:
             StaleStateError: Its newest picture is more than a second older than ``t``.
         """
         if self._lock_step:
-            return self.camera.latest()
+            return self.camera.read_latest()
         if self._lost is not None and t > self._lost[0]:
             raise self._lost[1]
         with self._lock:
@@ -252,7 +252,7 @@ class RowSampler:
             self._add(f"{TIMES}objects", ["t"], "float64")
         self._add(SOURCE, ["source"], "int64")
         self._pad_places: list[int] | None = None
-        """Places of those numbers of the pads that the dataset has; None for all."""
+        """Place of each of the dataset's numbers of pads, -1 for a control that they no longer have; None for all."""
         self.left_out = self._fit(known) if known is not None else []
         """Columns, and numbers of columns, that the dataset does not have."""
         self.columns = tuple(Column(key, dtype, tuple(names)) for key, (dtype, names) in self._parts.items())
@@ -267,8 +267,8 @@ class RowSampler:
             del self._parts[key]
         dtype, names = self._parts.get(PAD, ("", []))
         there = list(known.get(PAD, ()))
-        if there and set(there) < set(names):
-            self._pad_places = [names.index(name) for name in there]
+        if there != names and set(there) & set(names):
+            self._pad_places = [names.index(name) if name in names else -1 for name in there]
             self._parts[PAD] = dtype, there
             left += [f"{PAD}: {name}" for name in names if name not in there]
         return left
@@ -360,7 +360,7 @@ class RowSampler:
             put(f"{TIMES}objects", [snapshot.t_objects])
         put(SOURCE, [snapshot.source])
         if self._pad_places is not None:
-            found[PAD] = [found[PAD][k] for k in self._pad_places]
+            found[PAD] = [0.0 if k < 0 else found[PAD][k] for k in self._pad_places]
         return [value for values in found.values() for value in values]
 
     def _put_robot(self, put: _Put, robot: Robot, state: RobotState) -> None:

@@ -17,11 +17,11 @@ from ..errors import CommandError, HalError
 from ..host.process import Channel, SharedMemory, serve
 from ..host.scheduling import yield_to_others
 from .checking import check_compatible
-from .codecs import choose_encoder
 from .finish import CLOSING, finalise, recover_all
 from .index import check_next_episode, read_index
 from .layout import CameraSetup, DatasetLayout, lock_dataset, require_libraries, write_json
 from .live import RESERVE, LiveFolder, RowQueue
+from .videos import choose_encoder
 
 __all__ = ["free_bytes", "main"]
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from math import hypot, isfinite
 
 from ..commands import FIRST_STEP_DISTANCE, FIRST_STEP_TURN, CommandRecord
-from ..geometry import after_rotation, difference, rotate
+from ..geometry import apply_rotation, difference, rotate
 from ..types import Limited
 from .envelope import Envelope
 from .joint import ServoMotion
@@ -138,7 +138,7 @@ class TwistMotion(_CartesianMotion):
                 self._held[part] = self._at_rest(part)
         x, y, z, *orientation = goal
         vx, vy, vz, wx, wy, wz = twist
-        self._goal = [x + dt * vx, y + dt * vy, z + dt * vz, *after_rotation(orientation, (dt * wx, dt * wy, dt * wz))]
+        self._goal = [x + dt * vx, y + dt * vy, z + dt * vz, *apply_rotation(orientation, (dt * wx, dt * wy, dt * wz))]
 
     def _at_rest(self, part: int) -> bool:
         _, jacobian = self.envelope.pose_and_jacobian()
@@ -155,7 +155,7 @@ class TwistMotion(_CartesianMotion):
         if not shortened:
             return error
         self.envelope.limited |= Limited.LEAD
-        self._goal = [x + e for x, e in zip(pose, linear, strict=False)] + after_rotation(pose[3:], angular)
+        self._goal = [x + e for x, e in zip(pose, linear, strict=False)] + apply_rotation(pose[3:], angular)
         return linear + angular
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arguments import number, vector, whole
+from ..arguments import integer, number, vector
 from ..errors import CommandError
 from ..geometry import Pose, tcp_pose
 from .objects import LocatedObject
@@ -200,7 +200,7 @@ def push_to(
     target = vector("goal", goal, 2)
     run = SkillRun("push_to", arm, ("locate", "push"), **options)
     with run:
-        for left in range(whole("tries", tries, least=1), -1, -1):
+        for left in range(integer("tries", tries, least=1), -1, -1):
             run.begin("locate")
             found = locate()
             if found is None:

@@ -305,7 +305,7 @@ class CameraContract(Contract):
         for name in bench.driver.spec.streams:
             assert not getattr(second, name).flags.writeable
         assert app.camera.connected
-        assert app.camera.latest(_READ).stamp.seq >= second.stamp.seq
+        assert app.camera.read_latest(_READ).stamp.seq >= second.stamp.seq
         began = time.monotonic()
         app.camera.close()
         app.camera.close()
@@ -321,7 +321,7 @@ class CameraContract(Contract):
                 app.read(_APP_WAIT)
         assert time.monotonic() - began < 20 * _APP_WAIT + _SLACK
         with pytest.raises((StaleStateError, ConnectionLost)):
-            app.camera.latest(_APP_WAIT / 2)
+            app.camera.read_latest(_APP_WAIT / 2)
 
     @needs("lose")
     def test_an_app_notices_a_lost_camera(self, bench: CameraBench, app: _ListeningCamera) -> None:
@@ -331,7 +331,7 @@ class CameraContract(Contract):
         assert str(error)
         assert not app.camera.connected
         with pytest.raises(ConnectionLost):
-            app.camera.latest(_READ)
+            app.camera.read_latest(_READ)
         assert isinstance(app.wait_news(1), ConnectionLost), "on_connection reports the loss"
 
     @needs("lose", "restore")

@@ -349,6 +349,6 @@ class GripperContract(Contract):
 
 
 def _target_seq(hosted: HostedGripper) -> int:
-    newest = hosted.gripper.newest()
+    newest = hosted.gripper.peek()
     assert newest is not None
     return newest.target_seq

@@ -24,7 +24,7 @@ def grasp_it(rig: hal.Rig, random: np.random.Generator) -> bool:
     """Grasp the cube with the skill."""
     arm = rig.robots["panda"]
     found = locate_by_truth(rig, arm, "cube")
-    return bool(grasp(arm, grasp_pose(found, arm.gripper), width=found.width, speed=0.5))
+    return bool(grasp(arm, grasp_pose(found, arm.gripper), width=found.width, speed=0.3))
 
 
 def grasp_gently(rig: hal.Rig, random: np.random.Generator) -> bool:

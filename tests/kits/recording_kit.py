@@ -6,6 +6,7 @@ First recordings of mock rigs, then one to export, then a second rig in which re
 from __future__ import annotations
 
 import atexit
+import json
 import math
 import shutil
 import tempfile
@@ -25,9 +26,12 @@ from hal.rig import Rig
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
+import pyarrow.parquet as pq
 from recording_layout import check_layout, check_stamps
 
 from hal.recording import Dataset, Episode, Recorder
+from hal.recording.changing import EpisodeChange, change_episodes
+from hal.recording.layout import DatasetLayout
 
 __all__ = [
     "CAMERAS",
@@ -41,7 +45,9 @@ __all__ = [
     "check_layout",
     "check_stamps",
     "drive",
+    "join_metadata",
     "kill_writer",
+    "make_grasps_old",
     "make_recording",
     "mock_rig",
     "pictures",
@@ -150,6 +156,39 @@ def _recording() -> Path:
     return folder
 
 
+def join_metadata(root: Path) -> None:
+    """Put all metadata of each episode into its own file, as earlier versions did."""
+    for path in root.glob("episodes/[0-9]*.json"):
+        about = json.loads(path.read_text())
+        common = json.loads(path.with_name(f"{about.pop('common')}.json").read_text())
+        path.write_text(json.dumps(common | about))
+    for path in root.glob("episodes/common-*.json"):
+        path.unlink()
+
+
+def make_grasps_old(root: Path, width: float) -> None:
+    """Record grasps as the width of the object, and no force of a gripper, as earlier versions did."""
+    layout = DatasetLayout(root)
+    changes = {}
+    for episode in Dataset(root).episodes:
+        columns = {key: episode.columns[key].copy() for key in ("rig.setpoint", "action")}
+        for values in columns.values():
+            values[values[:, -1] == 0.0, -1] = width
+        changes[episode.number] = EpisodeChange({}, columns)
+    change_episodes(layout, changes)
+    key = "rig.setpoint_force"
+    for path in (layout.info, *layout.commons()):
+        about = json.loads(path.read_text())
+        del about["features"][key]
+        path.write_text(json.dumps(about))
+    stats = json.loads(layout.stats.read_text())
+    del stats[key]
+    layout.stats.write_text(json.dumps(stats))
+    for path in (*root.glob("data/*/*.parquet"), *root.glob("meta/episodes/*/*.parquet")):
+        table = pq.read_table(path)
+        pq.write_table(table.drop([name for name in table.column_names if key in name.split("/")]), path)
+
+
 def pictures(dataset: Dataset, what: str, camera: str) -> list[np.ndarray[Any, Any]]:
     """Return the frames or depth of a camera, one array per episode."""
     return [
@@ -218,6 +257,6 @@ class Stage:
         return Likeness(10.0 * math.log10(255.0**2 / max(error, 1e-9)), int(wrong.sum()))
 
     def pose(self, camera: str) -> Pose:
-        where = self.rig.cameras[camera].latest().T_world_camera
+        where = self.rig.cameras[camera].read_latest().T_world_camera
         assert where is not None
         return where

@@ -142,7 +142,7 @@ def test_an_arm_that_is_pushed_off_its_set_point_is_a_fault_holds_where_it_is_an
 
 def test_dynamics_are_read_back_and_restored(rig: hal.Rig) -> None:
     before = rig.world.dynamics("cube")
-    with rig.world.changed_dynamics("cube", lateral_friction=0.05, spinning_friction=0.02, mass=1.0):
+    with rig.world.change_dynamics("cube", lateral_friction=0.05, spinning_friction=0.02, mass=1.0):
         now = rig.world.dynamics("cube")
         assert now["lateral_friction"] == pytest.approx(0.05)
         assert now["spinning_friction"] == pytest.approx(0.02)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from recording_kit import mock_rig, record
 
-from hal.recording import Dataset, KeptRows, Recorder, delete_episodes, extract, merge, pack, split, trim
+from hal.recording import Dataset, KeptRows, Recorder, delete_episodes, extract, mark_episodes, merge, pack, split, trim
 
 Items = dict[str, np.ndarray[Any, Any]]
 PROGRAM = Path(__file__).parents[1] / "kits" / "lerobot_program.py"
@@ -47,6 +47,8 @@ def seen(folder: Path) -> dict[str, Items]:
     merge([packed, loose], folder / "merged")
     split(packed, {"a": [0, 3], "b": [1, 2]}, folder / "split")
     trim(packed, {1: KeptRows(2, 7), 3: KeptRows(4, 13)}, folder / "trimmed")
+    merge([loose], folder / "marked")
+    mark_episodes(folder / "marked", {1: True, 3: None})
     merge([loose], folder / "deleted")
     delete_episodes(folder / "deleted", [1])
     jobs: list[list[Any]] = [
@@ -58,7 +60,18 @@ def seen(folder: Path) -> dict[str, Items]:
         ["delete", str(folder / "their_merged"), str(folder / "their_rest"), [2, 5]],
         ["add", str(packed), str(folder / "their_added")],
     ]
-    names = ["loose", "packed", "extracted", "merged", "split/a", "split/b", "trimmed", "deleted", "their_split/a"]
+    names = [
+        "loose",
+        "packed",
+        "extracted",
+        "merged",
+        "split/a",
+        "split/b",
+        "trimmed",
+        "deleted",
+        "marked",
+        "their_split/a",
+    ]
     names += [Path(job[2]).name for job in jobs if job[0] != "split"]
     reads = [["read", str(folder / name), str(folder / f"{name}.npz")] for name in names]
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "cache")}
@@ -110,6 +123,16 @@ def test_lerobot_reads_the_numbers_and_pictures_of_the_recording(
         if key not in NUMBERED:
             assert np.array_equal(values, expected, equal_nan=values.dtype.kind == "f"), key
     assert np.array_equal(items["index"], np.arange(len(rows)))
+
+
+def test_a_mark_is_what_lerobot_reads(seen: dict[str, Items]) -> None:
+    items, source = seen["marked"], seen["loose"]
+    for key, values in items.items():
+        if key != "next.success":
+            assert np.array_equal(values, source[key], equal_nan=values.dtype.kind == "f"), key
+    ends = np.flatnonzero(items["next.done"])
+    assert items["next.success"][ends].tolist() == [True, True, False, False]
+    assert items["next.success"].sum() == 2
 
 
 def test_a_deletion_is_the_same_by_either(seen: dict[str, Items]) -> None:

@@ -117,7 +117,7 @@ def test_a_renderer_that_is_killed_takes_only_the_cameras() -> None:
 
         def lost() -> bool:
             try:
-                camera.latest(max_age=10.0)
+                camera.read_latest(max_age=10.0)
             except ConnectionLost:
                 return True
             return False

@@ -183,7 +183,7 @@ def test_a_camera_that_is_lost(rig: Rig, out: Path) -> None:
 
 def test_a_camera_that_is_lost_while_an_episode_begins(rig: Rig, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = rig.cameras["wrist"]
-    latest = camera.latest
+    latest = camera.read_latest
 
     def last(**more: float) -> Frame:
         frame = latest(**more)
@@ -193,7 +193,7 @@ def test_a_camera_that_is_lost_while_an_episode_begins(rig: Rig, out: Path, monk
 
     with Recorder(rig, out) as recorder:
         with monkeypatch.context() as patched:
-            patched.setattr(camera, "latest", last)
+            patched.setattr(camera, "read_latest", last)
             recorder.start()
         wait_until(lambda: recorder.status().trouble)
         assert "camera wrist is lost" in recorder.status().trouble, "and not only silent, a second later"
@@ -220,7 +220,7 @@ def test_a_late_camera_is_waited_for(rig: Rig, out: Path) -> None:
 
     def silent() -> bool:
         try:
-            camera.latest(max_age=1.0)
+            camera.read_latest(max_age=1.0)
         except StaleStateError:
             return True
         return False

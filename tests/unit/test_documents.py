@@ -2,7 +2,6 @@
 
 import importlib
 import re
-import runpy
 from functools import cache
 from pathlib import Path
 from unittest import mock
@@ -56,8 +55,10 @@ def help_text(*words: str) -> str:
     if words[0] == "hal":
         done = run_here(main, *words[1:], "--help")
     else:
+        name = f"{words[0]}.__main__" if hasattr(importlib.import_module(words[0]), "__path__") else words[0]
+        program = importlib.import_module(name)
         with mock.patch("sys.argv", [words[0], "--help"]):
-            done = run_here(lambda _: bool(runpy.run_module(words[0], run_name="__main__")))
+            done = run_here(lambda _: program.main() or 0)
     assert done.returncode == 0, f"{words}: {done.stderr}"
     return done.stdout
 

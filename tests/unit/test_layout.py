@@ -13,10 +13,10 @@ ROOT = Path(__file__).parents[2]
 MOST_BRANCHES, MOST_LINES = 15, 60
 """Of one function."""
 TANGLED = {
-    "hal/ark/arm_model.py:_joints",
-    "hal/ark/importing.py:import_ark",
-    "hal/ark/robots.py:place",
-    "hal/ark/scene.py:attached",
+    "packages/import-ark/src/hal_import_ark/arm_model.py:_joints",
+    "packages/import-ark/src/hal_import_ark/importing.py:import_ark",
+    "packages/import-ark/src/hal_import_ark/robots.py:place",
+    "packages/import-ark/src/hal_import_ark/scene.py:attached",
     "hal/kinematics/collision_model.py:_scene",
     "hal/recording/checking.py:_features",
     "hal/recording/checking.py:check_index",

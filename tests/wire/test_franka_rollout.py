@@ -51,7 +51,7 @@ def test_the_run_continues_after_a_failed_episode_with_the_persons_next_press(
     def watch(**options: Any) -> hal.Rig:
         rig = opened(**options)
         arm = rig.robots["arm"]
-        rig.clock.every(0.02, lambda: moved.append((rig.clock.now(), float(np.abs(arm.state().dq_set).max()))))
+        rig.clock.call_every(0.02, lambda: moved.append((rig.clock.now(), float(np.abs(arm.state().dq_set).max()))))
         return rig
 
     monkeypatch.setattr(hal, "open", watch)

@@ -44,7 +44,7 @@ def test_a_camera_works_again_after_it_was_unplugged() -> None:
         lost_at = time.monotonic()
         assert error.code == "unplugged"
         with pytest.raises(ConnectionLost):
-            cam.latest()
+            cam.read_latest()
         wait_for_code(cam, "device_not_found")
         assert not cam.connected
         cam.inject(disconnect=False)
@@ -347,7 +347,7 @@ def test_latest_never_waits() -> None:
         cam.read(timeout=PATIENCE)
         cam.inject(freeze=True)  # there is nothing to wait for
         began = time.monotonic()
-        assert cam.latest(max_age=60.0) is not None
+        assert cam.read_latest(max_age=60.0) is not None
         assert time.monotonic() - began < 5.0
         with pytest.raises(StaleStateError):
-            cam.latest(max_age=-1.0)
+            cam.read_latest(max_age=-1.0)

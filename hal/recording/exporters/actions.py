@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import CommandError
-from ...geometry import after_rotation, difference, quaternion_to_matrix
+from ...geometry import apply_rotation, difference, quaternion_to_matrix
 from ..layout import ACTION, SETPOINT
 from .content import ArmColumns, EpisodeContent
 
@@ -94,9 +94,9 @@ class ActionForm(NamedTuple):
 def action_dict(content: EpisodeContent) -> dict[str, NDArray[np.float32]]:
     """Return every form of an episode's actions, each (rows, n), under the names of robomimic's own ``action_dict``.
 
-    ``abs_pos``, ``abs_rot_axis_angle``, ``abs_rot_6d``, the same with ``rel_``, ``gripper`` (target width, m), and
-    ``joint_position`` and ``joint_velocity``; without those whose columns another program removed. With several arms
-    the names begin with ``robot0_``, ``robot1_``, ...
+    ``abs_pos``, ``abs_rot_axis_angle``, ``abs_rot_6d``, the same with ``rel_``, ``gripper`` (target width, m) and
+    ``gripper_force`` (asked of it, N), and ``joint_position`` and ``joint_velocity``; without those whose columns are
+    missing. With several arms the names begin with ``robot0_``, ``robot1_``, ...
     """
     found: dict[str, NDArray[np.float32]] = {}
     rotations: dict[str, RotationForm] = {"rot_axis_angle": "axis_angle", "rot_6d": "rotation_6d"}
@@ -110,6 +110,8 @@ def action_dict(content: EpisodeContent) -> dict[str, NDArray[np.float32]]:
                 forms[f"{name}_pos"], forms[f"{name}_{rotation}"] = of(content, arm, form)
         if (width := content.width(arm, ACTION)) is not None:
             forms["gripper"] = width[:, None]
+        if (force := content.later_force(arm)) is not None:
+            forms["gripper_force"] = force[:, None]
         found |= {lead + name: values.astype(np.float32) for name, values in forms.items()}
     return found
 
@@ -161,7 +163,7 @@ def _step(content: EpisodeContent, arm: ArmColumns, form: RotationForm) -> tuple
     steps = np.array([difference(start, end) for start, end in pairwise(poses)])
     if form == "axis_angle":
         return steps[:, :3], steps[:, 3:]
-    return steps[:, :3], np.array([_rotation(after_rotation((0.0, 0.0, 0.0, 1.0), step[3:]), form) for step in steps])
+    return steps[:, :3], np.array([_rotation(apply_rotation((0.0, 0.0, 0.0, 1.0), step[3:]), form) for step in steps])
 
 
 def _rotation(quaternion: ArrayLike, form: RotationForm) -> Array:

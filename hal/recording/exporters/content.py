@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...errors import CommandError, DeviceNotFound
 from ...images import Cropping
 from ..dataset import Dataset, Episode
-from ..layout import STATE
+from ..layout import GRIP_FORCE, MORE_STREAMS, SEGMENTATION, STATE, TAU_EXT, WRENCH_EXT
 
 __all__ = [
     "ArmColumns",
@@ -100,7 +100,7 @@ class PictureStream:
 
     camera: str
     what: str
-    """``rgb`` or ``depth``."""
+    """``rgb``, ``depth``, ``infrared``, ``infrared_right`` or ``segmentation``."""
     shape: tuple[int, ...]
     """(H, W, 3) or (H, W)."""
     dtype: np.dtype[Any]
@@ -181,6 +181,11 @@ class EpisodeContent:
         found: NDArray[Any] = self._table(key)[:, names.index(arm.lead + _GRIPPER)]
         return found
 
+    def later_force(self, arm: ArmColumns) -> NDArray[Any] | None:
+        """Return the force (rows,) that is asked of the arm's gripper one row later, N; None if it is not recorded."""
+        force = self.width(arm, GRIP_FORCE) if self.has(GRIP_FORCE) else None
+        return None if force is None else np.append(force[1:], force[-1:])
+
     def has(self, key: str) -> bool:
         """Return whether the episode has a column."""
         return key in self.episode.columns
@@ -203,7 +208,7 @@ class EpisodeContent:
         """Every selected stream of pictures."""
         found = []
         for camera in self.cameras:
-            for what in ("rgb", "depth") if self._depth else ("rgb",):
+            for what in ("rgb", "depth", *MORE_STREAMS) if self._depth else ("rgb", *MORE_STREAMS):
                 if (stream := self._stream(camera, what)) is not None:
                     found.append(stream)
         return tuple(found)
@@ -212,7 +217,7 @@ class EpisodeContent:
         episode = self.episode
 
         def read() -> Iterator[NDArray[Any]]:
-            return episode.frames(camera) if what == "rgb" else episode.depth(camera)
+            return episode.pictures(camera, "color" if what == "rgb" else what)
 
         try:
             first = next(read())
@@ -221,7 +226,7 @@ class EpisodeContent:
         scaling = self._scaling(first.shape[1], first.shape[0])
         if scaling is None:
             return PictureStream(camera, what, first.shape, first.dtype, self.rows, read)
-        scaled = scaling.color if what == "rgb" else scaling.depth
+        scaled = scaling.depth if what in ("depth", SEGMENTATION) else scaling.color
         shape = (*reversed(scaling.size), *first.shape[2:])
         return PictureStream(camera, what, shape, first.dtype, self.rows, lambda: map(scaled, read()))
 
@@ -272,7 +277,9 @@ class EpisodeContent:
 _OF_AN_ARM = {
     "joint_vel": "observation.velocity",
     "joint_effort": "observation.effort",
+    "joint_effort_ext": TAU_EXT,
     "eef_vel": "observation.twist",
+    "eef_wrench": WRENCH_EXT,
 }
 
 
@@ -299,12 +306,12 @@ def observations(content: EpisodeContent) -> dict[str, NDArray[Any]]:
 
 
 def picture_name(stream: PictureStream) -> str:
-    """Return ``wrist_image`` or ``wrist_depth``."""
-    return f"{stream.camera}_{'image' if stream.what == 'rgb' else 'depth'}"
+    """Return ``wrist_image``, ``wrist_depth``, ``wrist_infrared`` and so on."""
+    return f"{stream.camera}_{'image' if stream.what == 'rgb' else stream.what}"
 
 
 def with_channel(picture: NDArray[Any]) -> NDArray[Any]:
-    """Return a picture with channels last: (H, W, 3), or (H, W, 1) for depth."""
+    """Return a picture with channels last: (H, W, 3), or (H, W, 1) for one without colours."""
     return picture if picture.ndim == 3 else picture[:, :, None]
 
 

@@ -132,6 +132,9 @@ def _columns(
     job: ExportJob, content: EpisodeContent
 ) -> Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterator[NDArray[Any]]]]:
     numbers = job.observations(content) | {"action": job.action.values(content), "timestamp": content.grid}
+    for k, arm in enumerate(content.arms):
+        if (force := content.later_force(arm)) is not None:
+            numbers[f"action_robot{k}_gripper_force"] = force[:, None]
     job.unknown(content, numbers)
     for name, values in numbers.items():
         yield name, values.dtype, values.shape[1:], iter(values)

@@ -13,7 +13,7 @@ from ...errors import DriverMissing
 from ...geometry import Pose
 from ...types import RobotStatus, Trip
 from ..dataset import Episode
-from ..layout import SETPOINT, STATE
+from ..layout import SEGMENTATION, SETPOINT, STATE
 from .content import ArmColumns, EpisodeContent, PictureStream
 
 __all__ = ["write_rrd"]
@@ -169,7 +169,11 @@ def _picture(rr: Any, stream: PictureStream, picture: NDArray[Any]) -> Any:
 
         jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(picture), quality=_QUALITY, colorspace="RGB")
         return rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
-    return rr.EncodedDepthImage(_png(picture), media_type="image/png", meter=_DEPTH_UNITS)
+    if stream.what == "depth":
+        return rr.EncodedDepthImage(_png(picture), media_type="image/png", meter=_DEPTH_UNITS)
+    if stream.what == SEGMENTATION:
+        return rr.SegmentationImage((picture + 1).astype(np.uint16))
+    return rr.Image(picture, color_model="L")
 
 
 def _png(depth: NDArray[np.float32]) -> bytes:

@@ -375,7 +375,7 @@ def test_an_arm_that_is_not_simulated_drives_home_while_l2_is_held(
             hand.press("home")
 
         acts = user()
-        rig.clock.every(0.02, lambda: next(acts, None))  # type: ignore[attr-defined]  # of the lock-step clock
+        rig.clock.call_every(0.02, lambda: next(acts, None))  # type: ignore[attr-defined]  # of the lock-step clock
         assert app.run() == 0
     (episode,) = Dataset(tmp_path / "data").episodes
     assert (episode.success, episode.info["seed"]) == (True, seed_of(0))

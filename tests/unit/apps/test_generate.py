@@ -61,7 +61,7 @@ def test_a_dry_run_opens_nothing(folder: Path) -> None:
 
 
 def test_an_engine_that_is_not_installed_leaves_no_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "missing", lambda name: {name: "pip install it"})
+    monkeypatch.setattr(registry, "find_missing", lambda name: {name: "pip install it"})
     done = run_here(main, *SKILL, "--sim", "--set", "cameras={}", "--engine", "pybullet")
     assert (done.returncode, done.stdout) == (2, ""), done.stdout + done.stderr
     assert "'pybullet' is not installed" in done.stderr

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from app_kit import Done, run_here
 from PIL import Image
-from recording_kit import make_recording
+from recording_kit import join_metadata, make_recording
 
 from hal.apps import export, review
 
@@ -73,6 +73,7 @@ def test_a_damaged_episode_is_listed(tmp_path: Path) -> None:
 def test_a_slow_simulation_is_listed(tmp_path: Path) -> None:
     root = make_recording(tmp_path / "demo").root
     assert "real time" not in run(root).stdout
+    join_metadata(root)
     for number, pace in ((0, 0.99), (1, 0.8912)):
         file = root / f"episodes/{number:06d}.json"
         about = json.loads(file.read_text())

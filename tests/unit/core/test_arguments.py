@@ -57,7 +57,7 @@ WRONG = {
     "rig.clock.sleep(NAN)": "seconds must be",
     "rig.clock.sleep(math.inf)": "seconds must be",
     "rig.clock.sleep_until(math.inf)": "t must be",
-    "rig.clock.every(NAN, print)": "must be",
+    "rig.clock.call_every(NAN, print)": "must be",
     "rig.observe(after=rig.clock.now() + 100)": "in the future",
     "rig.observe(after=NAN)": "after must be",
     "rig.observe(timeout=NAN)": "timeout must be",

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import hal
-from hal.camera import Camera, place_of
+from hal.camera import Camera, find_place
 from hal.clock import RealClock
 from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConnectionLost, DeviceNotFound, StaleStateError
@@ -80,7 +80,7 @@ def test_the_same_camera_works_again(caplog: pytest.LogCaptureFixture) -> None:
             lost = news.get(timeout=20.0)
             assert isinstance(lost, ConnectionLost)
             assert not camera.connected
-            for use in (camera.read, camera.latest):
+            for use in (camera.read, camera.read_latest):
                 with pytest.raises(ConnectionLost, match="scene"):
                     use()
             other.read(timeout=20.0)
@@ -238,7 +238,7 @@ def difference(a: hal.Pose, b: hal.Pose) -> tuple[float, float]:
 def test_the_pose_of_a_camera_agrees_with_the_simulation(name: str) -> None:
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as rig:
         arm, camera = rig.robots["panda"], rig.cameras[name]
-        place = place_of(camera.spec, rig.robots)
+        place = find_place(camera.spec, rig.robots)
         assert place is not None
         poses = []
         with arm.control(rate_hz=50) as control:
@@ -260,7 +260,7 @@ def test_the_pose_of_a_camera_agrees_with_the_simulation(name: str) -> None:
 def test_the_pose_is_that_of_the_time_of_the_frame() -> None:
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as rig:
         arm, camera = rig.robots["panda"], rig.cameras["wrist"]
-        place = place_of(camera.spec, rig.robots)
+        place = find_place(camera.spec, rig.robots)
         assert place is not None
         with arm.control(rate_hz=50) as control:
             for tick in rig.clock.rate(50):
@@ -283,7 +283,7 @@ def test_the_pose_is_that_of_the_time_of_the_frame() -> None:
 def test_a_camera_without_a_view_has_no_place() -> None:
     with hal.open("panda_table", driver="mock") as rig:
         spec = replace(rig.cameras["scene"].spec, view=None)
-        assert place_of(spec, rig.robots) is None
+        assert find_place(spec, rig.robots) is None
 
 
 class Still(CameraDriver):
@@ -307,7 +307,7 @@ class Still(CameraDriver):
 def test_the_pose_of_a_frame_is_that_of_the_sensor_to_which_it_is_aligned(align: str) -> None:
     with hal.open("panda_table", driver="mock", overrides=[f"cameras.scene.align={align}"]) as rig:
         spec = rig.cameras["scene"].spec
-        camera = Camera(Still(spec), rig.clock, threaded=False, place=place_of(spec, rig.robots))
+        camera = Camera(Still(spec), rig.clock, threaded=False, place=find_place(spec, rig.robots))
         camera.open()
         pose = camera.read().T_world_camera
         assert pose is not None

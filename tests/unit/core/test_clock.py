@@ -103,8 +103,8 @@ def test_calls_come_at_their_times_however_long_the_wait() -> None:
     clock, world = lock_step()
     clock.sleep(1.0)
     slow, fast = Looker(clock), Looker(clock)
-    clock.every(0.5, slow)
-    end = clock.every(0.2, fast)
+    clock.call_every(0.5, slow)
+    end = clock.call_every(0.2, fast)
     clock.sleep(0.3)
     clock.sleep(0.7)
     assert slow.seen == [1.5, 2.0]
@@ -121,7 +121,7 @@ def test_calls_come_at_their_times_however_long_the_wait() -> None:
 def test_calls_may_be_ended_in_any_order(first: int) -> None:
     clock, _ = lock_step()
     lookers = [Looker(clock), Looker(clock)]
-    ends = [clock.every(0.1, looker) for looker in lookers]
+    ends = [clock.call_every(0.1, looker) for looker in lookers]
     clock.sleep(0.25)
     ends[first]()
     clock.sleep(0.25)
@@ -141,7 +141,7 @@ def test_a_call_may_end_itself_and_may_wait() -> None:
         clock.sleep(0.05)
         once()
 
-    end = clock.every(0.1, look)
+    end = clock.call_every(0.1, look)
     clock.sleep(1.0)
     assert once.seen == [0.1, 0.15]
     assert clock.now() == pytest.approx(1.0)
@@ -150,7 +150,7 @@ def test_a_call_may_end_itself_and_may_wait() -> None:
 def test_overdue_calls_are_skipped() -> None:
     clock, world = lock_step()
     looker = Looker(clock)
-    clock.every(0.1, looker)
+    clock.call_every(0.1, looker)
     world.t = 0.35  # time went on in another thread meanwhile
     clock.sleep(0.1)
     assert looker.seen == pytest.approx([0.35, 0.4])
@@ -159,7 +159,7 @@ def test_overdue_calls_are_skipped() -> None:
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan")])
 def test_the_period_of_calls_must_be_positive(seconds: float) -> None:
     with pytest.raises(CommandError):
-        lock_step()[0].every(seconds, lambda: None)
+        lock_step()[0].call_every(seconds, lambda: None)
 
 
 def test_short_sleeps_of_a_rig_add_up() -> None:

@@ -371,11 +371,11 @@ def test_controls_are_named_as_printed_on_the_pad(
 def test_a_program_operates_the_simulated_pad_of_a_rig(clock: str) -> None:
     with hal.open({"gamepads": {"pad": {"sim": True}}}, clock=clock) as rig:
         pad, simulated = rig.gamepads["pad"], rig.driver("pad")
+        pad.wake(changed := threading.Event())
         simulated.press("l2")
         if clock == "lock_step":
             rig.clock.sleep(0.1)
-        else:
-            pad.wait(5.0)
+        assert changed.wait(5.0)
         assert pad.state().axes["l2"] == 1.0
         assert pad.hold("l2")
         assert "no person holds it" in str(pad.distrust())

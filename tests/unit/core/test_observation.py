@@ -101,7 +101,7 @@ def test_without_cameras_it_waits_for_a_new_state(monkeypatch: pytest.MonkeyPatc
                 raise StaleStateError("late")
             return state_at(rig.clock.now())
 
-        monkeypatch.setattr(type(gripper), "newest", lambda _: None)
+        monkeypatch.setattr(type(gripper), "peek", lambda _: None)
         monkeypatch.setattr(type(gripper), "state_at", lambda _, t: late(t))
         assert rig.observe().grippers["panda"].width > 0.0
         assert len(calls) > 1, "a late gripper is waited for, too"

@@ -14,7 +14,7 @@ import pytest
 
 from hal.config import load
 from hal.errors import DriverMissing
-from hal.preflight import CheckResult, check_machine, has_realtime_kernel, preflight, real_arms
+from hal.preflight import CheckResult, check_machine, has_realtime_kernel, list_real_arms, preflight
 from hal.registry import DriverSpec
 from hal.specs import CameraSpec, Plan, RobotSpec
 
@@ -43,7 +43,7 @@ def of_arms(plan: Plan) -> list[CheckResult]:
 
 def test_a_simulated_rig_has_only_the_machine_and_its_engine_to_check() -> None:
     plan = load("panda_table", sim=True).resolve()
-    assert real_arms(plan) == ()
+    assert list_real_arms(plan) == ()
     bare = replace(plan, cameras=())
     assert [v.name for v in preflight(bare)] == ["kernel", "processor", "scheduling", "memory", "simulation"]
 

@@ -108,7 +108,7 @@ def test_a_missing_vendor_library_names_the_command(lab: Path) -> None:
         "DRIVER = DriverSpec('v', robot='lab_vendor_arm:Arm', requires={'no_such_vendor': 'pip install vendor-sdk'})\n"
     )
     (lab / "lab_vendor_arm.py").write_text("import no_such_vendor.core\nclass Arm: pass\n")
-    assert registry.missing("lab_vendor:DRIVER") == {"no_such_vendor": "pip install vendor-sdk"}
+    assert registry.find_missing("lab_vendor:DRIVER") == {"no_such_vendor": "pip install vendor-sdk"}
     with pytest.raises(DriverMissing, match="no_such_vendor.*pip install vendor-sdk") as caught:
         registry.load("lab_vendor:DRIVER", "robot")
     assert isinstance(caught.value, ImportError)
@@ -120,7 +120,7 @@ def test_a_library_that_is_installed_is_not_missing(lab: Path) -> None:
         "from hal.registry import DriverSpec\n"
         "DRIVER = DriverSpec('f', robot='x:Y', requires={'numpy': 'pip install numpy'})\n"
     )
-    assert registry.missing("lab_fine:DRIVER") == {}
+    assert registry.find_missing("lab_fine:DRIVER") == {}
 
 
 @pytest.mark.parametrize(

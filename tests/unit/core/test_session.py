@@ -37,7 +37,7 @@ class Bench:
             while left and left[0][0] <= self.rig.clock.now() - start + 1e-6:
                 left.pop(0)[1]()
 
-        self.rig.clock.every(0.02, act)  # type: ignore[attr-defined]  # of the lock-step clock
+        self.rig.clock.call_every(0.02, act)  # type: ignore[attr-defined]  # of the lock-step clock
 
     def run(self, seconds: float, *steps: tuple[float, Callable[[], object]]) -> str:
         end = self.rig.clock.now() + seconds
@@ -107,7 +107,7 @@ def test_after_a_stop_the_arm_waits_for_a_new_press(bench: Bench) -> None:
             standing.append(float(np.abs(bench.arm.state().dq_set).max()))
 
     start = bench.rig.clock.now()
-    bench.rig.clock.every(0.02, note)  # type: ignore[attr-defined]  # of the lock-step clock
+    bench.rig.clock.call_every(0.02, note)  # type: ignore[attr-defined]  # of the lock-step clock
     bench.run(2.0, *steps)
     assert bench.kinds == ["stopped", "resumed"]
     assert bench.events[0].reason

@@ -55,7 +55,7 @@ class Bench:
             while left and left[0][0] <= self.rig.clock.now() - start + 1e-6:
                 left.pop(0)[1]()
 
-        self.rig.clock.every(0.02, act)  # type: ignore[attr-defined]  # of the lock-step clock
+        self.rig.clock.call_every(0.02, act)  # type: ignore[attr-defined]  # of the lock-step clock
         self.session.run(lambda state: "time" if self.rig.clock.now() >= start + seconds else "")
         self.times = [t - start for t in self.times]
 
@@ -171,7 +171,7 @@ def test_a_reset_drives_every_arm_home_with_its_own_dead_man() -> None:
                 if abs(two.rig.clock.now() - start - t) < 0.011:
                     two.pad(name).press("l2")
 
-        two.rig.clock.every(0.02, act)  # type: ignore[attr-defined]  # of the lock-step clock
+        two.rig.clock.call_every(0.02, act)  # type: ignore[attr-defined]  # of the lock-step clock
         assert two.session.reset_scene(0) is True
         assert all(np.abs(arm.state().q_set - arm.home).max() < 1e-3 for arm in two.rig.robots.values())
 

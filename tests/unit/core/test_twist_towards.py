@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.geometry import Pose, after_rotation
+from hal.geometry import Pose, apply_rotation
 from hal.teleop import twist_towards
 
 numbers = st.floats(-1.0, 1.0)
@@ -25,7 +25,7 @@ def test_it_arrives_within_its_speeds_and_without_overshoot(goal: Pose, start: P
         twist = twist_towards(goal, tcp, 0.2, 0.8)
         assert np.linalg.norm(twist.linear) <= 0.2 + 1e-9
         assert np.linalg.norm(twist.angular) <= 0.8 + 1e-9
-        turned = after_rotation(tcp.orientation.tolist(), (dt * twist.angular).tolist())
+        turned = apply_rotation(tcp.orientation.tolist(), (dt * twist.angular).tolist())
         tcp = Pose(tcp.position + dt * twist.linear, turned)
         now = tcp.distance(goal)
         assert now[0] <= left[0] + 1e-9

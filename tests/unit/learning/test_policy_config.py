@@ -11,7 +11,7 @@ import pytest
 from errors_kit import raises_code
 
 import hal
-from hal.geometry import after_rotation
+from hal.geometry import apply_rotation
 from hal.learning.policy_config import PolicyConfig, load_policy_config
 
 CONFIG: dict[str, Any] = {
@@ -78,7 +78,7 @@ def test_orientations_become_angles_and_rotation_vectors(rig: hal.Rig) -> None:
         request = config.request(rig, replace(observation, robots=state), rig.robots, "")
         vector, rpy = np.split(request["state"].astype(float), 2)
         assert np.linalg.norm(vector) <= np.pi + 1e-6
-        turned = hal.Pose([0.0, 0.0, 0.0], after_rotation([0.0, 0.0, 0.0, 1.0], vector.tolist()))
+        turned = hal.Pose([0.0, 0.0, 0.0], apply_rotation([0.0, 0.0, 0.0, 1.0], vector.tolist()))
         np.testing.assert_allclose(turned.matrix(), pose.matrix(), atol=1e-6)
         np.testing.assert_allclose(hal.Pose.from_rpy([0.0, 0.0, 0.0], rpy).matrix(), pose.matrix(), atol=1e-6)
 

@@ -42,7 +42,7 @@ class Person:
         self._start = rig.clock.now()
         self.tripped = False
         assert isinstance(rig.clock, hal.clock.LockStepClock)
-        rig.clock.every(0.02, self._look)
+        rig.clock.call_every(0.02, self._look)
 
     def _look(self) -> None:
         while self._does and self._does[0][0] <= self._clock.now() - self._start:
@@ -100,7 +100,7 @@ def test_the_press_of_an_episode_does_not_start_the_move_home(rig: hal.Rig, tmp_
     episode = [(12.0, press("south")), (12.2, release("south")), (12.5, press()), (14.0, press("home"))]
     person = Person(rig, (0.5, press()), (11.0, release()), *episode, (17.0, end))
     person.hand.stick("dpad_y", 0.0)
-    rig.clock.every(0.02, lambda: person.hand.stick("dpad_y", 1.0 if person.deadman.record.presses == 2 else 0.0))
+    rig.clock.call_every(0.02, lambda: person.hand.stick("dpad_y", 1.0 if person.deadman.record.presses == 2 else 0.0))
     assert collect(rig, tmp_path, "--episodes", "2") == 1
     assert person.moved_by == {1, 2}
     (episode_,) = Dataset(tmp_path).episodes
@@ -116,11 +116,11 @@ def test_after_a_trip_on_the_way_home_it_takes_a_new_press(
     reflex = (1.2, lambda hand: arm.inject(fault="reflex"))
     person = Person(rig, (0.5, press()), reflex, (2.0, lambda hand: arm.recover()), (4.0, release()), (4.5, press()))
     standing: list[float] = []
-    rig.clock.every(
+    rig.clock.call_every(
         0.1, lambda: standing.append(np.abs(arm.state().dq_set).max() if 2.5 < rig.clock.now() - t0 < 4.4 else 0)
     )
     t0 = rig.clock.now()
-    rig.clock.every(20.0, lambda: end(person.hand))
+    rig.clock.call_every(20.0, lambda: end(person.hand))
     assert collect(rig, tmp_path, "--episodes", "1") == 1
     assert max(standing) < 1e-6, "nothing continues by itself"
     assert person.moved_by == {1, 2}

@@ -11,7 +11,7 @@ from specs import PANDA_HOME, panda
 
 import hal
 from hal.errors import CommandError, Unreachable
-from hal.geometry import after_rotation, difference
+from hal.geometry import apply_rotation, difference
 from hal.kinematics.arm import Kinematics
 from hal.motion.lines import METRES_PER_RADIAN, tcp_lines
 from hal.motion.planning import PathPlanner
@@ -28,7 +28,7 @@ def planner(**terms) -> PathPlanner:
 
 
 def moved(way, turn=(0.0, 0.0, 0.0)) -> list[float]:
-    return [*np.add(START[:3], way), *after_rotation(START[3:], turn)]
+    return [*np.add(START[:3], way), *apply_rotation(START[3:], turn)]
 
 
 def test_a_corner_is_rounded_near_its_pose_and_a_way_back_is_not() -> None:

@@ -177,11 +177,12 @@ def test_progress_goes_from_nothing_to_all(dataset: Dataset, tmp_path: Path) -> 
 
 def test_episodes_with_different_pictures_are_refused(tmp_path: Path) -> None:
     """Depth is no column of the dataset, so one episode may have it and the next one not."""
-    from recording_kit import mock_rig, record
+    from recording_kit import join_metadata, mock_rig, record
 
     with mock_rig() as rig, Recorder(rig, out=tmp_path / "demo", fps=20, task="x") as recorder:
         record(recorder, 0.2)
         record(recorder, 0.2)
+    join_metadata(tmp_path / "demo")
     file = tmp_path / "demo/episodes/000001.json"  # as a recorder that did not look at this once left it
     about = json.loads(file.read_text())
     for name, camera in about["cameras"].items():

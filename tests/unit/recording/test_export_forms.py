@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import make_recording, pictures
+from recording_kit import make_recording, mock_rig, pictures
 
 import hal
 from hal.recording import Dataset, Recorder
@@ -181,7 +181,7 @@ def test_zarr_is_a_replay_buffer(dataset: Dataset, tmp_path: Path) -> None:
     for name, values in data.items():
         assert len(values) == ends[-1], f"{name}: a replay buffer wants every array as long as the last episode's end"
     images = {f"{camera}_{kind}" for camera in ("scene", "wrist") for kind in ("image", "depth")}
-    assert set(data) == set(ROBOMIMIC) | images | {"action", "timestamp"}
+    assert set(data) == set(ROBOMIMIC) | images | {"action", "action_robot0_gripper_force", "timestamp"}
     assert np.array_equal(data["action"], column(dataset, "action"))
     for name, (key, part) in ROBOMIMIC.items():
         assert np.array_equal(data[name], column(dataset, key)[:, part]), name
@@ -319,12 +319,44 @@ def test_umi_and_robomimic_find_their_names(dataset: Dataset, two_arms: Dataset,
         made = export(source, "robomimic", tmp_path / "file.hdf5", cameras=[], force=True)
         with h5py.File(made.path) as file:
             parts = file["data/demo_0/action_dict"]
-            names = ["gripper", "joint_position", "joint_velocity"]
+            names = ["gripper", "gripper_force", "joint_position", "joint_velocity"]
             names += [f"{a}_{b}" for a in ("abs", "rel") for b in ("pos", "rot_6d", "rot_axis_angle")]
             assert set(parts) == {lead + name for lead in leads for name in names}
             assert parts[f"{leads[0]}abs_rot_6d"].shape[1] == 6
             state = file["data/demo_0/actions"][()]
             assert np.array_equal(parts[f"{leads[-1]}joint_position"][()], state[:, -8:-1])
+
+
+# Forces.
+
+
+def test_forces_are_exported_where_they_were_recorded(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
+    zarr = pytest.importorskip("zarr", reason="pip install zarr")
+    with mock_rig("lock_step", "cameras={}") as rig:
+        arm = rig.robots["panda"]
+        arm.inject(tau_ext=[0.5] * 7, wrench_ext=[1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+        rig.clock.sleep(0.1)
+        with Recorder(rig, tmp_path / "demo", fps=20) as recorder:
+            recorder.start()
+            assert arm.gripper is not None
+            arm.gripper.move(0.02, force=15.0)
+            recorder.save(wait=True)
+    source = Dataset(tmp_path / "demo")
+    force = column(source, "rig.setpoint_force").reshape(-1)
+    assert {15.0} < set(force.tolist())
+    later = np.append(force[1:], force[-1])[:, None]
+    with h5py.File(export(source, "robomimic", tmp_path / "a.hdf5").path) as file:
+        demo = file["data/demo_0"]
+        assert np.array_equal(demo["action_dict/gripper_force"][()], later)
+        assert np.array_equal(demo["obs/robot0_joint_effort_ext"][()], column(source, "rig.tau_ext"))
+        assert np.array_equal(demo["obs/robot0_eef_wrench"][()], column(source, "rig.wrench_ext"))
+    data = zarr.open(str(export(source, "zarr", tmp_path / "b").path), mode="r")["data"]
+    assert np.array_equal(data["action_robot0_gripper_force"][:], later)
+    assert np.array_equal(data["robot0_eef_wrench"][:], column(source, "rig.wrench_ext"))
+    with np.load(export(source, "npz", tmp_path / "c").path / "episode_000000.npz") as file:
+        for key in ("rig.setpoint_force", "rig.tau_ext", "rig.wrench_ext"):
+            assert np.array_equal(file[key], source.episodes[0].columns[key])
 
 
 # What was never known.

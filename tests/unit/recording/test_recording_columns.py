@@ -50,7 +50,7 @@ def test_every_column_is_in_the_documentation() -> None:
 
 
 def test_a_dataset_of_earlier_columns_takes_more_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the gripper's force, and from a time when pads had a button less."""
+    """Without the gripper's force, and from a time when pads had a button less, one more, and another order."""
 
     def record() -> list[str]:
         with mock_rig() as rig, Recorder(rig, tmp_path / "out") as recorder:
@@ -60,7 +60,7 @@ def test_a_dataset_of_earlier_columns_takes_more_episodes(tmp_path: Path, monkey
             return recorder.notes
 
     with monkeypatch.context() as earlier:
-        earlier.setattr("hal.recording.sampling.BUTTONS", BUTTONS[:-1])
+        earlier.setattr("hal.recording.sampling.BUTTONS", ("turbo", *BUTTONS[-2::-1]))
         earlier.setattr(RowSampler, "_fit", lambda sampler, known: [], raising=True)
         build = RowSampler._add
         keep = lambda sampler, key, *rest: None if key == "rig.setpoint_force" else build(sampler, key, *rest)  # noqa: E731
@@ -75,6 +75,7 @@ def test_a_dataset_of_earlier_columns_takes_more_episodes(tmp_path: Path, monkey
     assert first.columns["rig.pad"].shape[1] == second.columns["rig.pad"].shape[1]
     pressed = second.columns["rig.pad"][:, info["features"]["rig.pad"]["names"].index("connected")]
     assert pressed.all(), "each number is under its own name"
+    assert not second.columns["rig.pad"][:, info["features"]["rig.pad"]["names"].index("button_turbo")].any()
 
 
 def test_an_object_that_is_taken_away_is_not_known_any_more(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,8 @@ import pytest
 from recording_kit import check_layout, drive, kill_writer, mock_rig, record
 
 from hal.errors import ConnectionLost
-from hal.recording import Dataset, Recorder, finish, layout, recover
+from hal.recording import Dataset, Recorder, changing, finish, layout, mark_episodes, recover
+from hal.recording.checking import check_dataset
 from hal.recording.live import LiveContent
 
 
@@ -107,42 +110,49 @@ class Killed(BaseException):
     """Stands for the end of the process."""
 
 
-@pytest.mark.slow
-def test_it_may_be_killed_at_every_step_of_finishing(
-    torn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every file that is synced and every rename is a step; after each, the dataset opens and can be recovered."""
-    steps = [0]
-    at = [-1]
+class Steps:
+    """Counts every file that is synced, every rename and every removal of a folder; at one of them the process ends."""
 
-    def counted(act):  # type: ignore[no-untyped-def]
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done = 0
+        self.fatal = -1
+        for module in (layout, finish, changing):
+            monkeypatch.setattr(module, "sync_to_disk", self._counted(layout.sync_to_disk))
+        for owner, name in ((Path, "replace"), (Path, "rename"), (shutil, "rmtree")):
+            monkeypatch.setattr(owner, name, self._counted(getattr(owner, name)))
+
+    def _counted(self, act: Callable[..., object]) -> Callable[..., object]:
         def step(*args: object, **more: object) -> object:
-            steps[0] += 1
-            if steps[0] == at[0]:
+            self.done += 1
+            if 0 < self.fatal <= self.done:  # what the program does about it is not done, either
                 raise Killed
             return act(*args, **more)
 
         return step
 
-    monkeypatch.setattr(layout, "sync_to_disk", counted(layout.sync_to_disk))
-    monkeypatch.setattr(finish, "sync_to_disk", counted(finish.sync_to_disk))
-    monkeypatch.setattr(Path, "replace", counted(Path.replace))
-    monkeypatch.setattr(Path, "rename", counted(Path.rename))
-    monkeypatch.setattr(shutil, "rmtree", counted(shutil.rmtree))
+    def kill_at(self, step: int, act: Callable[[], object]) -> None:
+        """Do something, and be killed at a step of it."""
+        self.done, self.fatal = 0, step
+        with pytest.raises(Killed):
+            act()
+        self.fatal = -1
 
+
+@pytest.mark.slow
+def test_it_may_be_killed_at_every_step_of_finishing(
+    torn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After each step the dataset opens and can be recovered."""
+    steps = Steps(monkeypatch)
     reference = Path(shutil.copytree(torn, tmp_path / "reference"))
     recover(reference)
-    total = steps[0]
+    total = steps.done
     want = Dataset(reference).episodes[1].columns["action"]
     frames = list(Dataset(reference).episodes[1].frames("wrist"))
     assert total > 30
     for step in range(1, total + 1):
-        at[0] = -1
         out = Path(shutil.copytree(torn, tmp_path / f"killed{step}"))
-        steps[0], at[0] = 0, step
-        with pytest.raises(Killed):
-            recover(out)
-        at[0] = -1
+        steps.kill_at(step, lambda: recover(out))  # noqa: B023
         assert len(Dataset(out)) in (1, 2)
         for episode in Dataset(out).episodes:
             assert len(episode.columns["action"]) == episode.length
@@ -155,3 +165,42 @@ def test_it_may_be_killed_at_every_step_of_finishing(
         assert stats == (reference / "meta/stats.json").read_text(), "nothing counts twice"
         assert not list(out.glob("episodes/*.removed"))
         shutil.rmtree(out)
+
+
+@pytest.mark.slow
+def test_it_may_be_killed_at_every_step_of_a_mark(torn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After each step the dataset opens with the marks before or after; the next change, or recovery, completes it."""
+    before = Path(shutil.copytree(torn, tmp_path / "before"))
+    recover(before)
+    linked = tmp_path / "linked"
+    shutil.copytree(before, linked, copy_function=os.link)
+    steps = Steps(monkeypatch)
+    after = Path(shutil.copytree(before, tmp_path / "after"))
+    marks = {0: False, 1: True}
+    mark_episodes(after, marks)
+    total, seen = steps.done, set()
+    assert [episode.success for episode in Dataset(before).episodes] == [True, None]
+    for step in range(1, total + 1):
+        out = Path(shutil.copytree(linked, tmp_path / "killed", copy_function=os.link))
+        steps.kill_at(step, lambda: mark_episodes(out, marks))  # noqa: B023
+        found = [episode.success for episode in Dataset(out).episodes]
+        seen.add(tuple(found))
+        for was, now, asked in zip((True, None), found, marks.values(), strict=True):
+            assert now in (was, asked)
+        made = (out / "episodes/change.partial/list.json").exists() or found == [False, True]
+        expected = [False, True] if made else [True, None]
+        if step % 2:
+            recover(out)
+        else:
+            mark_episodes(out, dict(enumerate(expected)))
+        assert [episode.success for episode in Dataset(out).episodes] == expected
+        assert not list(check_dataset(Dataset(out)))
+        assert (content(out) == content(after)) is made
+        shutil.rmtree(out)
+    assert {(True, None), (False, True)} <= seen
+    assert content(linked) == content(before), "files that are linked elsewhere stay as they are there"
+
+
+def content(root: Path) -> dict[str, bytes]:
+    """Return the content of every file of a dataset, by its name."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*.*") if path.is_file()}

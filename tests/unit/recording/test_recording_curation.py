@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from app_kit import run_here
 from errors_kit import raises_code
-from recording_kit import check_layout, drive, make_recording, mock_rig
+from recording_kit import check_layout, drive, join_metadata, make_recording, mock_rig
 
 from hal.apps.dataset import main
 from hal.errors import CommandError
@@ -127,6 +127,7 @@ def test_a_trimmed_dataset_keeps_everything_else(still: Dataset, tmp_path: Path)
 
 def test_rows_can_be_chosen_and_metadata_follows(still: Dataset, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(still.root, tmp_path / "demo"))
+    join_metadata(folder)
     path = folder / "episodes/000000.json"
     about = json.loads(path.read_text())
     gaps = [{"from_s": t, "to_s": t + 0.05, "rows": 1, "why": "disk"} for t in (0.1, 0.8, 2.5)]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import check_layout, drive, kill_writer, make_recording, mock_rig, record
+from recording_kit import check_layout, drive, join_metadata, kill_writer, make_recording, mock_rig, record
 
 from hal.errors import CommandError, ConnectionLost, DatasetError, DeviceNotFound, HalError
 from hal.learning.replay import RecordedTrajectory
@@ -48,8 +48,8 @@ def rig() -> Iterator[Rig]:
 
 EACH = 2 + 2 + 2
 """Files of an episode: rows and own file, two videos, two of depth."""
-INDEX = 4
-"""Files of the index."""
+INDEX = 4 + 1
+"""Files of the index, and of the metadata that the episodes have in common."""
 
 
 def files(root: Path, episodes: Sequence[int] = (0, 1, 2)) -> list[Path]:
@@ -61,7 +61,8 @@ def files(root: Path, episodes: Sequence[int] = (0, 1, 2)) -> list[Path]:
 
 def number_of(path: Path) -> int | None:
     """Return the number of the episode that a file belongs to; None for the index."""
-    return int(path.stem[-3:]) if path.stem[-3:].isdecimal() and "meta" not in path.parts else None
+    own = path.stem[-3:].isdecimal() and "meta" not in path.parts and "common" not in path.stem
+    return int(path.stem[-3:]) if own else None
 
 
 # What reads a dataset.
@@ -241,7 +242,11 @@ def test_nothing_is_recorded_over_episodes_whose_index_is_lost(out: Path, rig: R
     assert left == {path: before[path] for path in left}
 
     (done,) = repair(out)
-    assert done.startswith("the index was rebuilt from 3 episodes; it was wrong: meta/")
+    made = (
+        "meta/stats.json was made again from" if lost == "meta/stats.json" else "the index was rebuilt from 3 episodes"
+    )
+    assert done.startswith(made)
+    assert "; it was wrong: meta/" in done
     check_layout(out)
     assert checked(out) == []
     assert repair(out) == []
@@ -262,6 +267,36 @@ def test_the_index_comes_back_as_it_was(whole: Path, out: Path) -> None:
     assert old["stats"].keys() == new["stats"].keys()
     for key, values in old["stats"].items():
         assert np.allclose(values, new["stats"][key], atol=1e-6), key
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "change"),
+    [
+        ("action", "mean", 1e-3),
+        ("observation.images.wrist", "std", 0.01),
+        ("rig.time.grid", "max", 0.1),
+        ("action", "", 0),
+    ],
+)
+def test_changed_statistics_are_noticed_and_made_again(
+    whole: Path, out: Path, key: str, name: str, change: float
+) -> None:
+    file = out / "meta/stats.json"
+    stats = json.loads(file.read_text())
+    if name:
+        stats[key][name] = (np.array(stats[key][name]) + change).tolist()
+    else:
+        del stats[key]
+    file.write_text(json.dumps(stats))
+    (error,) = checked(out)
+    assert error.startswith("meta/stats.json: ")
+    assert key in error
+    (done,) = repair(out)
+    assert key in done
+    assert checked(out) == []
+    old, new = index_files(whole)["stats"], index_files(out)["stats"]
+    assert old.keys() == new.keys()
+    assert all(np.allclose(values, new[key], atol=1e-9) for key, values in old.items())
 
 
 def test_an_index_that_lists_fewer_episodes_than_there_are(out: Path, rig: Rig) -> None:
@@ -286,6 +321,7 @@ def test_an_index_cannot_be_rebuilt_without_every_episode(out: Path) -> None:
 
 
 def test_episodes_of_an_older_version_need_the_names_of_their_columns(whole: Path, out: Path) -> None:
+    join_metadata(out)
     for file in out.glob("episodes/*.json"):
         about = json.loads(file.read_text())
         del about["features"]

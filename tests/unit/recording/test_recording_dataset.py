@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import json
+import os
+import random
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import CAMERAS, check_layout, drive, kill_writer, mock_rig, record, small
+from recording_kit import CAMERAS, check_layout, drive, join_metadata, kill_writer, mock_rig, record, small
 
 import hal
 from hal.errors import CommandError, DeviceNotFound, HalError
 from hal.recording import Dataset, Recorder, dataset, recover, repair
 from hal.recording.checking import check_dataset
+from hal.recording.exporters import export
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +61,11 @@ def test_an_episode_has_the_metadata_of_its_source(made: Path) -> None:
 def test_columns_of_a_long_dataset_do_not_fill_the_memory(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second, third = Dataset(made).episodes
     before = first.columns
-    size = sum(values.nbytes for values in before.values())
-    monkeypatch.setattr(dataset, "_MEMORY", dataset._ColumnMemory(2 * size))
+    size = dataset._bytes(before)
+    monkeypatch.setattr(dataset, "_MEMORY", dataset._ReadMemory(2 * size))
     for episode in (second, third):
         episode.__dict__.pop("columns", None)
-    dataset._MEMORY.add(first, before)
+    dataset._MEMORY.add(first, "columns", size)
     assert second.columns is second.columns
     assert first.columns is before, "both fit"
     assert third.columns is third.columns
@@ -70,6 +74,28 @@ def test_columns_of_a_long_dataset_do_not_fill_the_memory(made: Path, monkeypatc
     assert "columns" in third.__dict__
     assert first.columns is not before
     assert np.array_equal(first.columns["action"], found["action"])
+
+
+def test_pictures_are_read_in_any_order_by_threads_and_forked_processes(made: Path) -> None:
+    episode = Dataset(made).episodes[0]
+    expected = {camera: list(episode.frames(camera)) for camera in CAMERAS}
+
+    def is_right(seed: int) -> bool:
+        dice = random.Random(seed)
+        rows = [(dice.choice(CAMERAS), dice.randrange(episode.length)) for _ in range(40)]
+        return all(np.array_equal(episode.frame(camera, row), expected[camera][row]) for camera, row in rows)
+
+    assert is_right(0), "the videos are open now"
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(is_right, range(1, 5)))
+    children = []
+    for seed in (5, 6):
+        if (child := os.fork()) == 0:
+            os._exit(0 if is_right(seed) else 1)
+        children.append(child)
+    assert is_right(7), "while they read, too"
+    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
+    assert is_right(8)
 
 
 def test_rows_are_at_their_times_and_nothing_is_missing(made: Path) -> None:
@@ -160,6 +186,7 @@ def test_depth_is_kept_by_all_episodes_or_by_none(tmp_path: Path) -> None:
 def test_depth_in_another_unit_is_another_kind(made: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(made, copy)
+    join_metadata(copy)
     for file in copy.glob("episodes/*.json"):
         about = json.loads(file.read_text())
         unit = about["cameras"]["wrist"]["depth_unit_m"]
@@ -322,6 +349,13 @@ def test_infrared_and_segmentation_are_recorded_on_request(tmp_path: Path) -> No
     assert infrared[0].dtype == np.uint8
     assert np.abs(infrared[0].astype(float) - drawn[0].infrared).mean() < 6.0
     assert np.ptp(infrared[0]) > 30
+    with np.load(export(out, "npz", tmp_path / "npz").path / "episode_000000.npz") as file:
+        assert np.array_equal(file["camera_segmentation"], numbers)
+        assert np.array_equal(file["camera_infrared"], infrared)
+    small_ones = export(out, "zarr", tmp_path / "zarr", size=(32, 24)).path / "data"
+    for name, kind in (("scene_infrared", "|u1"), ("scene_segmentation", "<i4")):
+        head = json.loads((small_ones / name / ".zarray").read_text())
+        assert (head["shape"], head["dtype"]) == ([episode.length, 24, 32, 1], kind)
     for camera, stream in (("scene", "depth"), ("wrist", "segmentation"), ("wrist", "infrared")):
         with pytest.raises(DeviceNotFound):
             episode.pictures(camera, stream)

@@ -20,8 +20,8 @@ from hal.apps import review as review_app
 from hal.errors import CommandError, DatasetError, DeviceNotFound
 from hal.recording import Dataset, Recorder, delete_episodes, merge, repair
 from hal.recording.checking import check_dataset
-from hal.recording.codecs import read_video
 from hal.recording.exporters import export
+from hal.recording.videos import read_video
 
 NUMBERED = {"episode_index", "index"}
 

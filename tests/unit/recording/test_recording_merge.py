@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import CAMERAS, check_layout, mock_rig, record
+from recording_kit import CAMERAS, check_layout, join_metadata, mock_rig, record
 
 from hal.errors import CommandError, DatasetError
 from hal.recording import (
     Dataset,
     Episode,
     Recorder,
+    building,
     delete_episodes,
     mark_episodes,
     merge,
@@ -70,6 +71,7 @@ def test_a_recorder_switches_rigs(part: Path) -> None:
     assert one.stamps["grid"][0] == two.stamps["grid"][0] == 0.0, "each has a clock of its own"
     assert np.array_equal(one.columns["action"][:6], two.columns["action"][:6])
     assert all(one.info[key] is two.info[key] for key in ("rig", "features")), "in memory once"
+    assert len(list(part.glob("episodes/common-*.json"))) == 1, "and on the disk"
 
 
 def test_episodes_are_renumbered_and_nothing_else_changes(part: Path, tmp_path: Path) -> None:
@@ -114,6 +116,7 @@ def test_a_key_sorts_and_takes_each_once(part: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_merged_is_refused(part: Path, tmp_path: Path) -> None:
     copy, out = tmp_path / "copy", tmp_path / "out"
     shutil.copytree(part, copy)
+    join_metadata(copy)
     with raises_code(CommandError, "output_exists"):
         merge([part], copy)
     with raises_code(CommandError, "no_folder"):
@@ -206,7 +209,7 @@ def test_a_part_may_be_write_protected(part: Path, tmp_path: Path, monkeypatch: 
 def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(merging, "GROUP", 3)
+    monkeypatch.setattr(building, "GROUP", 3)
     demo = tmp_path / "demo"
     merge([part, part], demo)
     names = [[str(path.relative_to(demo)) for path in demo.glob(f"{kind}/*.*")] for kind in ("data/*", "videos/*/*")]
@@ -330,15 +333,15 @@ def test_a_reader_follows_joined_files_and_refuses_another_episode(
     assert opened.episodes[1].place.data == (0, before.episodes[0].length)
     assert opened.episodes[1].success is False
 
-    fresh, read_video = Dataset(demo).episodes[0], dataset_module.read_video
+    fresh, read_picture = Dataset(demo).episodes[0], dataset_module.read_picture
 
     def read_after_a_deletion(*args: Any) -> Any:
         delete_episodes(demo, [0])
-        return read_video(*args)
+        return read_picture(*args)
 
     fresh.files("wrist")
     with monkeypatch.context() as patched, raises_code(DatasetError, "dataset_changed"):
-        patched.setattr(dataset_module, "read_video", read_after_a_deletion)
+        patched.setattr(dataset_module, "read_picture", read_after_a_deletion)
         fresh.frame("wrist", 0)
     first = opened.episodes[0]
     for read in (lambda: next(first.frames("wrist")), lambda: first.frame("wrist", 0), first.read_table):
@@ -377,16 +380,16 @@ def test_a_lock_of_a_dataset_that_was_replaced_is_not_kept(
 def test_two_merges_into_one_folder_exclude_each_other(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    building = DatasetLayout(tmp_path / ".out.merging")
+    place = DatasetLayout(tmp_path / ".out.merging")
     monkeypatch.setattr(layout_module, "_PATIENCE", 0.0)
-    with lock_dataset(building):
-        (building.root / "data").mkdir()
+    with lock_dataset(place):
+        (place.root / "data").mkdir()
         with raises_code(CommandError, "dataset_locked"):
             merge([part], tmp_path / "out")
-        assert (building.root / "data").exists()
+        assert (place.root / "data").exists()
         with pytest.raises(FileExistsError):
-            merging._link(part / "meta/info.json", building.episodes / ".lock")
-    (building.root / "link").symlink_to("data")
+            building.link_file(part / "meta/info.json", place.episodes / ".lock")
+    (place.root / "link").symlink_to("data")
     assert merge([part], tmp_path / "out") == 2, "what a killed program left is removed"
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["data", "depth", "episodes", "meta", "videos"]
 
@@ -426,7 +429,7 @@ def test_a_mount_point_is_not_replaced(part: Path, tmp_path: Path, monkeypatch: 
 def test_rows_stay_in_their_file_only_if_nothing_in_it_changes(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(merging, "GROUP", 2)
+    monkeypatch.setattr(building, "GROUP", 2)
     demo = tmp_path / "demo"
     merge([part, part], demo)
 
@@ -454,13 +457,13 @@ def test_large_videos_are_linked_and_small_ones_joined_up_to_a_size(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = (part / "videos/observation.images.wrist/chunk-000/file-000.mp4").stat().st_size
-    monkeypatch.setattr(merging, "VIDEO_MB", 2.9e-6 * size)
+    monkeypatch.setattr(building, "VIDEO_MB", 2.9e-6 * size)
     merge([part, part, part], joined := tmp_path / "joined")
     videos = [episode.place.video("wrist") for episode in Dataset(tmp_path / "joined").episodes]
     assert [file for file, _ in videos] == [0, 0, 1, 1, 2, 2]
     assert [first for _, first in videos[::2]] == [0, 0, 0]
     check_layout(tmp_path / "joined")
-    monkeypatch.setattr(merging, "VIDEO_MB", 1.5e-6 * size)
+    monkeypatch.setattr(building, "VIDEO_MB", 1.5e-6 * size)
     delete_episodes(joined, [0, 5])
     for one, other in zip(Dataset(part).episodes[::-1] * 2, Dataset(joined).episodes, strict=True):
         assert pictures_of(one, "color") == pictures_of(other, "color"), "a file of which a part is left is no link"
@@ -509,6 +512,7 @@ def make_old(root: Path) -> None:
         return key.replace("rig.", "observation.")
 
     new = ("source", "intervention", "next.done", "next.success")
+    join_metadata(root)
     for path in [root / "meta/info.json", *root.glob("episodes/*.json")]:
         about = json.loads(path.read_text())
         about.pop("files", None)

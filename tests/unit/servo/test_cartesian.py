@@ -13,7 +13,7 @@ from servo_kit import FAR, Bench, tightened
 from specs import panda
 
 from hal.commands import Kind
-from hal.geometry import Pose, after_rotation, difference, quaternion_to_matrix, rotate
+from hal.geometry import Pose, apply_rotation, difference, quaternion_to_matrix, rotate
 from hal.specs import WorkspaceSpec
 from hal.types import Limited, RobotStatus
 
@@ -125,7 +125,7 @@ def test_a_pose_is_reached_straight_and_not_passed(shares: tuple[float, float]) 
     bench = Bench(replace(spec, limits=tightened(spec.limits, *shares)), tcp_speed=0.25)
     start = bench.servo.kinematics.pose(bench.q)
     goal = Pose(
-        start.position + np.array([0.025, 0.02, -0.03]), after_rotation(start.orientation.tolist(), [0.0, 0.1, 0.1])
+        start.position + np.array([0.025, 0.02, -0.03]), apply_rotation(start.orientation.tolist(), [0.0, 0.1, 0.1])
     )
     bench.stream(3.0, Kind.CARTESIAN_TARGET, [*goal.position, *goal.orientation])
     distance, angle = bench.servo.kinematics.pose(bench.q).distance(goal)
@@ -142,7 +142,7 @@ def test_the_first_pose_must_be_near() -> None:
     bench = Bench(tcp_speed=0.25)
     pose = bench.servo.kinematics.pose(bench.q)
     for position, rotation in (((0.0, 0.0, 0.051), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (0.0, 0.21, 0.0))):
-        orientation = after_rotation(pose.orientation.tolist(), rotation)
+        orientation = apply_rotation(pose.orientation.tolist(), rotation)
         refused = bench.send(Kind.CARTESIAN_TARGET, [*(pose.position + position), *orientation])
         bench.run(0.2)
         assert bench.servo.report.refused == refused
@@ -216,8 +216,8 @@ def test_outside_the_workspace_the_tcp_may_only_come_back_in() -> None:
 
 @given(st.tuples(UNIT, UNIT, UNIT), st.tuples(UNIT, UNIT, UNIT), st.tuples(UNIT, UNIT, UNIT))
 def test_quaternions(a, turn, vector):
-    start = after_rotation((0.0, 0.0, 0.0, 1.0), a)
+    start = apply_rotation((0.0, 0.0, 0.0, 1.0), a)
     matrix = quaternion_to_matrix(start)
     assert rotate(start, vector) == pytest.approx(list(matrix @ vector), abs=1e-12)
-    end = after_rotation(start, turn)
+    end = apply_rotation(start, turn)
     assert difference([0.0, 0.0, 0.0, *start], [1.0, 2.0, 3.0, *end]) == pytest.approx([1, 2, 3, *turn], abs=1e-7)

@@ -17,7 +17,7 @@ from torque_kit import NOTHING, Driven, N, one, wheels
 from hal.commands import Kind, Session
 from hal.dynamics import Dynamics
 from hal.errors import CommandError, Fault
-from hal.geometry import after_rotation, difference, rotate
+from hal.geometry import apply_rotation, difference, rotate
 from hal.kinematics.arm import Kinematics
 from hal.servo.controllers import (
     RAMP,
@@ -408,6 +408,6 @@ def test_torques_change_in_proportion() -> None:
 
 def test_a_turn_of_the_tcp_is_the_rotation_vector() -> None:
     pose = KINEMATICS.fk(HOME)
-    turned = (*pose[:3], *after_rotation(pose[3:], (0.0, 0.02, 0.0)))
+    turned = (*pose[:3], *apply_rotation(pose[3:], (0.0, 0.02, 0.0)))
     tau = Applied(OperationalSpace()).torques(error=difference(pose, turned))
     assert tau == pytest.approx(JACOBIAN.T @ [0.0, 0.0, 0.0, 0.0, 50.0 * 0.02, 0.0], abs=1e-9)

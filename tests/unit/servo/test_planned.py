@@ -14,7 +14,7 @@ from specs import PANDA_HOME, panda
 
 from hal.commands import PATH_KNOTS, PathSection
 from hal.errors import CommandError, Unreachable
-from hal.geometry import after_rotation, difference
+from hal.geometry import apply_rotation, difference
 from hal.kinematics.arm import Kinematics
 from hal.motion.planning import PathPlanner
 from hal.servo.path import JointPath, ZonePlanner
@@ -26,7 +26,7 @@ ARM = Kinematics(SPEC.kinematics)
 PLANNER = PathPlanner(ARM, SPEC.limits.lower, SPEC.limits.upper)
 START = ARM.fk(PANDA_HOME)
 WAY = np.array([0.1, 0.25, -0.2])
-GOAL = [*np.add(START[:3], WAY), *after_rotation(START[3:], (0.2, -0.1, 0.3))]
+GOAL = [*np.add(START[:3], WAY), *apply_rotation(START[3:], (0.2, -0.1, 0.3))]
 PLAN = PLANNER.plan_poses(PANDA_HOME, [GOAL])
 
 
@@ -51,7 +51,7 @@ def off_line(bench: Bench) -> tuple[float, float]:
     for q in bench.history:
         pose = ARM.fk(q)
         share = float(np.subtract(pose[:3], START[:3]) @ WAY / (WAY @ WAY))
-        there = [*np.add(START[:3], share * WAY), *after_rotation(START[3:], share * whole[3:])]
+        there = [*np.add(START[:3], share * WAY), *apply_rotation(START[3:], share * whole[3:])]
         error = difference(pose, there)
         away, turned = max(away, np.linalg.norm(error[:3])), max(turned, np.linalg.norm(error[3:]))
     return float(away), float(turned)
@@ -128,7 +128,7 @@ def random_line(numbers: np.random.Generator) -> tuple[PathSection, ...]:
         q = numbers.uniform(SPEC.limits.lower, SPEC.limits.upper).tolist()
         start, way, turn = ARM.fk(q), numbers.normal(0.0, 0.07, 3), numbers.normal(0.0, 0.2, 3)
         with contextlib.suppress(Unreachable):
-            return PLANNER.plan_poses(q, [[*np.add(start[:3], way), *after_rotation(start[3:], turn)]]).sections
+            return PLANNER.plan_poses(q, [[*np.add(start[:3], way), *apply_rotation(start[3:], turn)]]).sections
 
 
 def test_limits_hold_along_any_line_with_pauses() -> None:

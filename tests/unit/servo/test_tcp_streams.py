@@ -16,7 +16,7 @@ from servo_kit import Bench, tightened
 
 from hal.commands import Kind
 from hal.config import load
-from hal.geometry import after_rotation
+from hal.geometry import apply_rotation
 from hal.specs import RobotSpec, WorkspaceSpec
 from hal.types import Limited
 
@@ -124,7 +124,7 @@ class Stream:
         rng = self.random
         x, y, z, *turn = self.bench.servo.kinematics.fk(self.bench.q)
         at = [v + rng.uniform(-0.2, 0.2) for v in (x, y, z)]
-        return Kind.CARTESIAN_TARGET, at + after_rotation(turn, [rng.uniform(-0.5, 0.5) for _ in "xyz"])
+        return Kind.CARTESIAN_TARGET, at + apply_rotation(turn, [rng.uniform(-0.5, 0.5) for _ in "xyz"])
 
     def _chunk(self) -> tuple[Kind, list[float]]:
         rng = self.random

@@ -163,7 +163,7 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
                 pad.press("l2")
                 ends.pop()()
 
-        ends = [rig.clock.every(0.05, tick)]
+        ends = [rig.clock.call_every(0.05, tick)]
 
     before = len(log)
     result = grasp(rig.robots["panda"], POSE, width=WIDTH, speed=1.0, hold=1.2, deadman=deadman, progress=pause)

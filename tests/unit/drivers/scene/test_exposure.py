@@ -173,7 +173,7 @@ def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once(moving: 
         change()
         frame = public.read()
         assert public.read() is frame
-        assert public.latest() is frame
+        assert public.read_latest() is frame
         assert len(drawing.asked) == len(heard) == public.counts().frames == number
 
 

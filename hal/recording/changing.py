@@ -1,0 +1,231 @@
+"""Change finished episodes where they are: their marks, or the values of columns.
+
+Only the files that hold these episodes are written, anew, in ``episodes/change.partial``. Then a list of their
+destinations is written: from here on the change counts as made, and whatever opens the dataset next to write into it
+completes it (:mod:`~hal.recording.finish`). Files that are linked into other datasets stay as they are there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CommandError, DatasetError
+from .about import read_about
+from .codecs import column_stats, exchange_flags, stats_as_lists
+from .dataset import Dataset
+from .finish import last_row, move_files, recover_all, write_table
+from .foreign import is_foreign
+from .index import merged_stats, read_stats, read_table
+from .layout import (
+    MOVES,
+    SUCCESS,
+    DatasetLayout,
+    EpisodePlace,
+    lock_dataset,
+    read_json,
+    sync_to_disk,
+    write_json,
+)
+from .validation import dataset_errors
+
+__all__ = ["EpisodeChange", "change_episodes", "existing_episodes", "open_to_change", "mark_episodes", "refuse_foreign"]
+
+
+class EpisodeChange(NamedTuple):
+    """What changes in a finished episode."""
+
+    about: Mapping[str, Any]
+    """Entries of ``episodes/N.json``."""
+    columns: Mapping[str, NDArray[Any]]
+    """New values (rows, n) of columns, by their stored keys."""
+
+
+def mark_episodes(dataset: str | Path | Dataset, marks: Mapping[int, bool | None]) -> None:
+    """Mark episodes as a success (True), a failure (False) or neither (None).
+
+    Takes as long as the files of these episodes need, however many others there are.
+
+    Raises:
+        CommandError: There is no such episode (code ``no_episodes``), the dataset has changed since it was opened
+            (``dataset_changed``), or it was edited by another program (``foreign_dataset``).
+        DatasetError: The dataset is damaged; nothing was changed.
+        OSError: The disk refuses; nothing was changed.
+    """
+    with open_to_change(dataset) as opened:
+        existing_episodes(opened, marks)
+        changes = {}
+        for number, mark in marks.items():
+            episode = opened.episodes[number]
+            before = episode.success
+            if mark is not before:
+                rows = SUCCESS in opened.info["features"] and (mark is True) is not (before is True)
+                columns = {SUCCESS: last_row(episode.length, mark is True)} if rows else {}
+                changes[number] = EpisodeChange({"success": mark}, columns)
+        change_episodes(DatasetLayout(opened.root), changes)
+
+
+def existing_episodes(dataset: Dataset, episodes: Iterable[int]) -> frozenset[int]:
+    """Return the numbers of episodes, all of which exist. Raises CommandError (code ``no_episodes``)."""
+    count, chosen = len(dataset), frozenset(episodes)
+    if unknown := sorted(chosen - set(range(count))):
+        raise CommandError(
+            f"there is no episode {unknown[0]} in {dataset.root}; there are {count}, from 0 on", code="no_episodes"
+        )
+    if not chosen:
+        raise CommandError("no episode was selected", code="no_episodes")
+    return chosen
+
+
+def refuse_foreign(layout: DatasetLayout) -> None:
+    """Raise CommandError (code ``foreign_dataset``) for a dataset without this project's own files."""
+    if is_foreign(layout):
+        raise CommandError(
+            f"{layout.root} was edited or recorded by another program, and has no episodes/; it can be read and "
+            "exported, and LeRobot's own tools edit it",
+            code="foreign_dataset",
+        )
+
+
+@contextlib.contextmanager
+def open_to_change(dataset: str | Path | Dataset) -> Iterator[Dataset]:
+    """Hold the lock of a dataset, whose interrupted episodes and changes are finished first.
+
+    Raises CommandError as :func:`mark_episodes`.
+    """
+    known = dataset if isinstance(dataset, Dataset) else None
+    root = known.root if known is not None else Path(dataset)  # type: ignore[arg-type]
+    layout = DatasetLayout(root.expanduser().resolve())
+    refuse_foreign(layout)
+    if not layout.info.exists():
+        Dataset(root)  # raises what is wrong; the lock would make a folder
+    with lock_dataset(layout):
+        recover_all(layout)
+        if known is not None and known.has_changed():
+            raise CommandError(f"{root} has changed since it was opened; nothing was done", code="dataset_changed")
+        yield known or Dataset(layout.root)
+
+
+def change_episodes(layout: DatasetLayout, changes: Mapping[int, EpisodeChange]) -> None:
+    """Change episodes of a dataset that is locked (:func:`open_to_change`); all of them or, on an error, none."""
+    if not changes:
+        return
+    folder, moves = layout.change, list[tuple[str, str]]()
+
+    def put(target: Path, write: Callable[..., object], *content: Any) -> None:
+        new = folder / f"{len(moves):06d}{target.suffix}"
+        write(new, *content)
+        moves.append((new.name, str(target.relative_to(layout.root))))
+
+    folder.mkdir()
+    try:
+        places = {number: EpisodePlace.of(number, read_about(layout, number)) for number in changes}
+        for file in sorted({place.data[0] for number, place in places.items() if changes[number].columns}):
+            first = {number: place.data[1] for number, place in places.items() if place.data[0] == file}
+            put(layout.data(file), _write_rows, layout, file, first, changes)
+        before, after = {}, {}
+        for path in sorted({layout.entry(place.entry) for place in places.values()}):
+            with dataset_errors(layout.root, path):
+                before[path] = read_table(path)
+                after[path] = _changed_entries(before[path], changes)
+            put(path, write_table, after[path])
+        for number, change in changes.items():
+            data = read_json(layout.about(number)) | change.about
+            put(layout.about(number), write_json, data, None)
+        if keys := {key for change in changes.values() for key in change.columns}:
+            put(layout.stats, write_json, _changed_stats(layout, keys, before, after))
+        put(layout.info, _copy, layout.info)  # last, and new, so that the change is noticed
+        write_json(folder / MOVES, moves)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            layout.remove(folder)
+        raise
+    move_files(layout, folder)
+
+
+def _copy(new: Path, source: Path) -> None:
+    shutil.copyfile(source, new)
+    sync_to_disk(new)
+
+
+def _write_rows(
+    new: Path, layout: DatasetLayout, file: int, first: Mapping[int, int], changes: Mapping[int, EpisodeChange]
+) -> None:
+    """Write a file of rows with the changed values; ``first`` has the place of each episode's first row in it."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = layout.data(file)
+    with dataset_errors(layout.root, path), pq.ParquetFile(path, page_checksum_verification=True) as old:
+        sizes = [old.metadata.row_group(k).num_rows for k in range(old.metadata.num_row_groups)]
+        table = old.read(use_threads=False)
+    owners = table["episode_index"].to_numpy()
+    for key in dict.fromkeys(key for number in first for key in changes[number].columns):
+        field = table.schema.field(key)
+        column = table[key].combine_chunks()
+        listed = pa.types.is_fixed_size_list(field.type)
+        flat = (column.flatten() if listed else column).to_numpy(zero_copy_only=False)
+        values = flat.reshape(len(table), -1).copy()
+        for number, begin in first.items():
+            if key in changes[number].columns:
+                rows = changes[number].columns[key]
+                if set(owners[begin : begin + len(rows)].tolist()) != {number}:
+                    name = str(path.relative_to(layout.root))
+                    raise DatasetError("has rows of another episode", file=name, episode=number)
+                values[begin : begin + len(rows)] = rows
+        array = pa.array(values.reshape(-1))
+        array = pa.FixedSizeListArray.from_arrays(array, values.shape[1]) if listed else array
+        table = table.set_column(table.schema.get_field_index(key), field, array.cast(field.type))
+    with pq.ParquetWriter(new, table.schema, write_page_checksum=True) as writer:
+        begin = 0
+        for size in sizes:
+            writer.write_table(table.slice(begin, size), row_group_size=size)
+            begin += size
+    sync_to_disk(new)
+
+
+def _changed_stats(
+    layout: DatasetLayout, keys: Set[str], old: Mapping[Path, Any], new: Mapping[Path, Any]
+) -> dict[str, Any]:
+    """Return ``meta/stats.json`` after files of ``meta/episodes`` have changed.
+
+    Those of columns of flags, such as marks, follow from the changed files alone; for others all files are read.
+    """
+    with dataset_errors(layout.root, layout.stats):
+        stats: dict[str, Any] = read_json(layout.stats)
+        flags = {key for key in keys if read_json(layout.info)["features"][key]["dtype"] == "bool"}
+        found = merged_stats(layout, keys - flags, new) if keys - flags else {}
+        for key in flags:
+            found[key] = {name: np.asarray(value) for name, value in stats[key].items()}
+            for path in old:
+                before, after = (read_stats(each[path], {key})[key] for each in (old, new))
+                found[key] = exchange_flags(found[key], before, after)
+    return stats | stats_as_lists(found)
+
+
+def _changed_entries(table: Any, changes: Mapping[int, EpisodeChange]) -> Any:
+    """Return the rows of a file of ``meta/episodes`` with new marks and statistics."""
+    import pyarrow as pa
+
+    numbers = table["episode_index"].to_pylist()
+    new: dict[str, dict[int, Any]] = {}
+    for number in changes.keys() & set(numbers):
+        row, change = numbers.index(number), changes[number]
+        if "success" in change.about and "success" in table.column_names:
+            new.setdefault("success", {})[row] = change.about["success"]
+        for key, values in change.columns.items():
+            for name, value in column_stats(values).items():
+                new.setdefault(f"stats/{key}/{name}", {})[row] = value.tolist()
+    for name, rows in new.items():
+        values = table[name].to_pylist()
+        for row, value in rows.items():
+            values[row] = value
+        field = table.schema.field(name)
+        table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))
+    return table
