@@ -46,7 +46,7 @@ def list_devices(plan: Plan) -> list[str]:
         simulated = not robot.attended or (plan.world is not None and robot.driver == plan.world.driver)
         where = f"simulated ({robot.driver})" if simulated else _real(robot, robot)
         gripper = robot.gripper
-        hand = f", gripper 0..{gripper.width_max:g} m" if gripper else ""
+        hand = f", gripper {gripper.width_min:g}..{gripper.width_max:g} m" if gripper else ""
         if gripper and robot.attended and simulated:
             hand += f", {_real(robot, gripper)}"
         lines.append(f"robot    {robot.name:10s} {robot.model}, {where}, {robot.rate_hz:g} Hz{hand}")

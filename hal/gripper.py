@@ -62,6 +62,11 @@ class Gripper:
         return self.spec.width_max
 
     @property
+    def width_min(self) -> float:
+        """Distance between the fingers when closed on nothing, m: not all of them meet."""
+        return self.spec.width_min
+
+    @property
     def force_max(self) -> float:
         """Greatest force that may be asked of the fingers, N."""
         return self.spec.force_max or self.spec.force
@@ -132,7 +137,11 @@ class Gripper:
     def width_of(self, fraction: float) -> float:
         """Return the width in m of a grip from 0 (open) to 1 (closed). CommandError for other values."""
         grip = number("a grip, from 0 (open) to 1 (closed),", fraction, least=0.0, most=1.0)
-        return (1.0 - grip) * self.spec.width_max
+        return self.width_max - grip * (self.width_max - self.width_min)
+
+    def grip_at(self, width: float) -> float:
+        """Return the grip, from 0 (open) to 1 (closed), of a width in m; 0 or 1 beyond the gripper's range."""
+        return min(1.0, max(0.0, (self.width_max - width) / (self.width_max - self.width_min)))
 
     # Commands that return at once.
 
@@ -157,8 +166,9 @@ class Gripper:
     ) -> GripperMotion:
         """Start to close on an object and hold it.
 
-        The fingers are asked to close, whatever the width, so that they press: ``width_target`` is 0. The object counts
-        as held if they end between ``width - inner`` and ``width + outer``; otherwise the outcome is ``MISSED``.
+        The fingers are asked to close, whatever the width, so that they press: ``width_target`` is ``width_min``. The
+        object counts as held if they end between ``width - inner`` and ``width + outer``; otherwise the outcome is
+        ``MISSED``.
 
         Args:
             width: Expected width of the object, m.
@@ -305,7 +315,7 @@ class Gripper:
             raise AttributeError(f"a gripper has no attribute {name!r}{hint}", name=name, obj=self)
 
     def __repr__(self) -> str:
-        return f"<Gripper of {self._robot}: 0..{self.spec.width_max:g} m, driver {self.spec.driver}>"
+        return f"<Gripper of {self._robot}: {self.width_min:g}..{self.width_max:g} m, driver {self.spec.driver}>"
 
 
 class GripperMotion:

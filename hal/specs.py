@@ -97,7 +97,7 @@ class GripperSpec:
     opened: Floats = ()
     """Position of each finger joint at the greatest width, rad or m; empty where each slides by half the width."""
     closed: Floats = ()
-    """Position of each finger joint at width 0, rad or m; empty like ``opened``."""
+    """Position of each finger joint when closed, rad or m; empty like ``opened``."""
     widths: tuple[tuple[float, float], ...] = ()
     """Pairs of a position of the first joint (rad or m) and the width there, m, from closed to open; empty where the
     width is proportional to the way of the joints."""
@@ -109,6 +109,11 @@ class GripperSpec:
     def arm(self) -> str:
         """Name of its arm."""
         return self.name.removesuffix(".gripper")
+
+    @property
+    def width_min(self) -> float:
+        """Width when closed on nothing, m: the pads of some grippers do not meet."""
+        return max(0.0, self.width_at(0.0))
 
     def finger_positions(self, width: float) -> list[float]:
         """Return the position of each finger joint, rad or m, at a width, m."""

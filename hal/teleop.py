@@ -149,7 +149,7 @@ class Teleop:
             state = gripper.peek()
             if state is None or gripper.trouble:
                 return None  # the width is unknown
-            difference = wanted - (1.0 - state.width / gripper.width_max)
+            difference = wanted - gripper.grip_at(state.width)
             crossed = self._side * difference < 0.0
             self._has_grip = crossed or abs(difference) < _CROSSED
             self._side = difference
@@ -160,7 +160,7 @@ class Teleop:
         if pressed and not self._was_toggle:
             state = gripper.peek()
             if state is not None and not gripper.trouble:
-                closed = state.grasped is True or state.width_target < _HALF * gripper.width_max
+                closed = state.grasped is True or gripper.grip_at(state.width_target) > _HALF
                 self._toggled = 0.0 if closed else 1.0
         elif not pressed:
             self._toggled = None

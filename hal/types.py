@@ -280,7 +280,9 @@ class GripperState:
     width: float
     """Distance between the fingers, m."""
     width_target: float
-    """Width that the newest command asked of the fingers, m: 0 after a grasp, whose fingers press beyond the object."""
+    """Width that the newest command asked of the fingers, m: the least (mostly 0) after a grasp, which presses
+    beyond the object.
+    """
     force_target: float
     """Force of the newest command, N; the gripper's default before the first."""
     moving: bool

@@ -276,7 +276,7 @@ class MockGripper(GripperDriver):
     def move(self, width: float, speed: float, force: float) -> None:
         self._expect_open()
         self.log.append((width, speed, force))
-        self._start(min(max(width, 0.0), self.spec.width_max), speed, force)
+        self._start(min(max(width, self.spec.width_min), self.spec.width_max), speed, force)
 
     def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
         """Close until an object, or the other finger, stops the fingers."""

@@ -35,6 +35,8 @@ HARD_CONTACT = (0.02, 1.0)
 """Time constant, s, and damping ratio of contacts without a stiffness: MuJoCo's own."""
 HARD_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 """How much of a contact's ideal force acts: little of it is lost, so that fingers do not sink into what they hold."""
+PAD_IMPEDANCE = (0.99, 0.999, 0.001, 0.5, 2.0)
+"""The same between a gripper's pad and what it holds."""
 BOUNCING_IMPEDANCE = (0.999, 0.999, 0.001, 0.5, 2.0)
 """The same of a contact with restitution."""
 CARRIED = 5
@@ -53,6 +55,7 @@ class ContactParameters(NamedTuple):
     solref: tuple[float, float]
     solimp: tuple[float, float, float, float, float]
     priority: int
+    solmix: float = 1.0
 
 
 def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactParameters:
@@ -74,6 +77,8 @@ def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactPa
     condim = 6 if contact.rolling_friction > 0.0 else 4 if contact.spinning_friction > 0.0 else 3
     stiffness, damping = contact.contact_stiffness, contact.contact_damping
     if stiffness is None or damping is None:
+        if contact.pad:
+            return ContactParameters(friction, condim, (2.0 * h, 1.0), PAD_IMPEDANCE, 0, 1e3)
         return ContactParameters(friction, condim, HARD_CONTACT, HARD_IMPEDANCE, 0)
     mass = mass or 1.0
     ratio = max(SOFTEST, 2.0 * (stiffness * h + damping) * h / mass)
@@ -93,7 +98,7 @@ def add_pairs(spec: Any, bodies: Collection[Body]) -> None:
     h = spec.option.timestep
     for a, k, b, m, friction, bounce in friction_pairs(bodies):
         one, other = spec.geom(f"{a.link_path(k)}/0"), spec.geom(f"{b.link_path(m)}/0")
-        first = max((one, other), key=lambda shape: shape.priority)
+        first = max((one, other), key=lambda shape: (shape.priority, shape.solmix))
         spin, roll = (max(one.friction[place], other.friction[place]) for place in (1, 2))
         solref, solimp = first.solref, first.solimp
         if bounce > 0.0:

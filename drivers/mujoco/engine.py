@@ -48,6 +48,8 @@ class LinkContact:
     """N/m; None where contacts are as hard as the step allows."""
     contact_damping: float | None = None
     """Ns/m"""
+    pad: bool = False
+    """Whether it is a gripper's: what it holds must not sink in, for that would be an error of the width."""
 
 
 @dataclass(kw_only=True)

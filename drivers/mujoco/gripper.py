@@ -30,9 +30,10 @@ class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
 
     def _drive(self, speed: float) -> None:
         motors, at, travel = self._world.motors, self._at, self._travel
-        targets, speeds = travel.positions(self._target), travel.speeds(speed)
+        width = self._width()[0]
+        targets, speeds = travel.positions(self._target), travel.speeds(speed, width)
         motors.target[at], motors.feed[at] = targets, 0.0
-        motors.efforts[at], motors.speeds[at] = travel.efforts(self._force), speeds
+        motors.efforts[at], motors.speeds[at] = travel.efforts(self._force, width), speeds
         if self._followers is not None:  # their couplings move them; the law of the motors has to expect it
             motors.target[self._followers] = [ratio * targets[of] + offset for of, ratio, offset in self._follow]
             motors.speeds[self._followers] = [abs(ratio) * speeds[of] for of, ratio, _ in self._follow]

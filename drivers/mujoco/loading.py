@@ -9,20 +9,28 @@ import itertools
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.drivers.scene.gripper import FingerTravel
-from hal.drivers.scene.records import SHAPES, check_names, followers_of, hulls_of, joint_drives, mimics_of, required
-from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
+from hal.drivers.scene.records import (
+    SHAPES,
+    check_names,
+    followers_of,
+    hulls_of,
+    joint_drives,
+    mimics_of,
+    pad_links,
+    required,
+)
+from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless, mesh_points
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Pose, quaternion_to_matrix
-from hal.kinematics.hulls import Hull, mesh_parts, principal_axes, uniform_solid
-from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfLink, UrdfModel, UrdfVisual, parse_xml
+from hal.kinematics.hulls import Hull, principal_axes, uniform_solid
+from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfLink, UrdfModel, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
 from .contacts import CARRIED, contact_parameters
@@ -194,8 +202,14 @@ def plan_robot(spec: RobotSpec, *, mirrored: bool = False) -> BodyPlan:
         if moving[name].damping:
             body.damping[number] = moving[name].damping
     body.followers = followers_of(spec, urdf)
+    for name, friction in pad_links(spec, urdf).items():
+        contact = body.contacts[body.links[name]]
+        contact.pad = True
+        if friction:
+            contact.lateral_friction, contact.spinning_friction = friction
     if spec.gripper:
-        levers = FingerTravel(spec.gripper).speeds(1.0)
+        middle = spec.gripper.width_max / 2.0
+        levers = FingerTravel(spec.gripper).speeds(1.0, middle)
         plan.fingers = {
             name: FINGER_INERTIA * (0.5 / lever) ** 2 for name, lever in zip(spec.gripper.joints, levers, strict=True)
         }
@@ -206,7 +220,7 @@ def plan_robot(spec: RobotSpec, *, mirrored: bool = False) -> BodyPlan:
             if name not in (one.joint for one in body.followers):
                 body.efforts[body.joints[name]] = STRONGEST
         if spec.gripper:
-            efforts = FingerTravel(spec.gripper).efforts(spec.gripper.force)
+            efforts = FingerTravel(spec.gripper).efforts(spec.gripper.force, middle)
             body.efforts |= {body.joints[name]: e for name, e in zip(spec.gripper.joints, efforts, strict=True)}
     root = Pose(spec.base_position, spec.base_orientation)
     if spec.kinematics.base_link:
@@ -224,13 +238,14 @@ def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: flo
     order = (urdf.root, *(joint.child for joint in urdf.outwards))
     number = {name: k for k, name in enumerate(order)}
     carried_by = {joint.child: joint for joint in urdf.joints.values()}
+    pads = pad_links(spec, urdf)
     links: list[LinkPlan] = []
     fixed: list[str] = []
     problems: list[Problem] = []
     for name in order:
         link, found = urdf.links[name], carried_by.get(name)
         try:
-            shapes = list(_shapes(link, scale))
+            shapes = list(_shapes(link, scale, name in pads))
         except ValueError as error:
             text = f"MuJoCo cannot load link {name!r}: {error}"
             problems.append(Problem(str(urdf.path), key, text, "bad_mesh"))
@@ -283,7 +298,7 @@ def _range(joint: UrdfJoint, scale: float) -> tuple[float, float] | None:
 
 def _contact(link: ElementTree.Element) -> LinkContact:
     """Return the frictions in a link's ``<contact>``, a custom element of PyBullet's."""
-    given = {}
+    given: dict[str, Any] = {}
     for name in ("lateral_friction", "rolling_friction", "spinning_friction"):
         element = link.find(f"contact/{name}")
         if element is not None and element.get("value"):
@@ -310,12 +325,12 @@ def _primitive(spec: BodySpec) -> Shape:
     raise ConfigError([Problem("objects", f"objects.{spec.name}.shape", message, "unknown_shape")])
 
 
-def _shapes(link: UrdfLink, scale: float) -> Iterator[Shape]:
+def _shapes(link: UrdfLink, scale: float, sliced: bool) -> Iterator[Shape]:
     """Yield the collision shapes of a link; raises ValueError if a mesh has no hull."""
     for shape in link.collisions:
         pose = Pose(shape.pose.position * scale, shape.pose.orientation)
         if shape.shape == "mesh":
-            for points in _hulls(shape):
+            for points in mesh_points(shape, sliced=sliced):
                 yield Shape("mesh", (), pose, points * scale)
         elif shape.shape == "box":
             yield Shape("box", tuple(side / 2.0 * scale for side in shape.size), pose)
@@ -324,29 +339,6 @@ def _shapes(link: UrdfLink, scale: float) -> Iterator[Shape]:
         else:
             radius, length = shape.size
             yield Shape(shape.shape, (radius * scale, length / 2.0 * scale), pose)
-
-
-def _hulls(shape: UrdfVisual) -> Iterator[Array]:
-    """Yield the vertices of each part of a mesh: parts of an OBJ have hulls of their own, as in PyBullet."""
-    name = Path(shape.file).name
-    for points in _parts(Path(shape.file)):
-        points = np.unique(points * np.array(shape.size), axis=0)
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 3 else np.zeros(3)
-        if spread[2] <= 1e-6 * max(spread[0], 1e-9):
-            raise ValueError(f"mesh {name} is flat, and has no hull; use a thin box as its collision shape")
-        yield points
-
-
-def _parts(file: Path) -> list[Array]:
-    if file.suffix.lower() == ".obj":
-        return mesh_parts(file)
-    import trimesh  # 0.3 s
-
-    try:
-        mesh: Any = trimesh.load(str(file), force="mesh")
-        return [np.array(mesh.vertices, dtype=np.float64)]
-    except Exception as error:  # whatever the reader of that format raises
-        raise ValueError(f"mesh {file.name} cannot be read: {error}") from None
 
 
 # --- masses ----------------------------------------------------------------------------------------------------------

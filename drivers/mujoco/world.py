@@ -78,7 +78,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         option.gravity = spec.gravity
         option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        option.impratio = 100.0  # what is held slides less
+        option.impratio = 1000.0  # what is held slides less
         option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # Several contacts between two convex shapes: on by default since MuJoCo 4.
         option.enableflags = int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
@@ -94,6 +94,8 @@ class MujocoWorld(SimulatedWorld[Body]):
         if self.fault is not None:
             self.steps += 1
             return
+        for prepare in self._before_steps.values():
+            prepare()
         if self._following:
             self._hold_mirrors()
         motors, model, data = self.motors, self.model, self.data

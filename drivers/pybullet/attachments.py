@@ -50,7 +50,7 @@ class AttachedObjects:
             body.set_base_pose(client, compose(here, body.base))
 
 
-STRENGTH = 10.0
+STRENGTH = 30.0
 """Torques of the mirror's motors, as a multiple of the arm's: nothing in the world stops it or makes it sag."""
 
 
@@ -72,7 +72,7 @@ class MirroredArm:
         self._torques = [STRENGTH * body.efforts[joint] for joint in self._joints]
         self._fingers = [body.joints[name] for name in gripper.joints] if gripper else []
         self._gripper = gripper
-        self._grip = FingerTravel(gripper).efforts(gripper.force) if gripper else []
+        self._grip = FingerTravel(gripper).efforts(gripper.force, gripper.width_max / 2.0) if gripper else []
         self._gains = [position_gain(dt)] * len(self._joints)
         self._fresh = False
         """Whether a state of the arm has arrived since the last step."""

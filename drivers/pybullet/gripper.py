@@ -28,12 +28,12 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
         self._world.handle(self._body.name, active)
 
     def _drive(self, speed: float) -> None:
-        client, travel = self._world.client, self._travel
+        client, travel, width = self._world.client, self._travel, self._width()[0]
         drives = zip(
             self._joints,
             travel.positions(self._target),
-            travel.efforts(self._force),
-            travel.speeds(speed),
+            travel.efforts(self._force, width),
+            travel.speeds(speed, width),
             strict=True,
         )
         for joint, position, effort, fastest in drives:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -14,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.drivers.scene.drawn import PLANE
-from hal.drivers.scene.records import SHAPES, check_names, hulls_of, joint_drives, mimics_of, required
-from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
+from hal.drivers.scene.records import SHAPES, check_names, hulls_of, joint_drives, mimics_of, pad_links, required
+from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless, mesh_points
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Transform, compose, inverse
-from hal.kinematics.hulls import Hull, uniform_solid
+from hal.kinematics.hulls import Hull, convex_hull, uniform_solid
 from hal.kinematics.mesh_files import mesh_file, mesh_near
-from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml
+from hal.kinematics.urdf import UrdfMimic, UrdfModel, UrdfVisual, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
 from .engine import Body, Gear, PyBulletClient, silenced
@@ -36,8 +37,12 @@ __all__ = [
 
 MARGIN, THIN = 0.001, 0.2
 """Margin that PyBullet adds around hulls, m; and what is taken off a thin hull at most, as a share of its thickness."""
+SLIVER = 1e-6
+"""Area of a face, as a share of the greatest, below which it is left out: its normal is a matter of chance."""
 LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
 """Mass, kg, and moment of inertia, kg m2, of a mere frame that a joint moves: Bullet takes none without."""
+PAD_STIFFNESS, PAD_DAMPING = 2e5, 2e3
+"""Of contacts of a gripper's pads, N/m and Ns/m: so hard that the width is that of what is held."""
 FINGER_MASS = 0.1
 """Least mass of a finger that moves or holds something, kg: the solver lets one of 29 g press with no more than 26 N.
 The drive that moves with it is in no URDF. Fingers at rest have their own mass, so that the arm's inertia is right."""
@@ -90,7 +95,9 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
     key = f"robots.{spec.name}"
     urdf = checked_urdf(spec.urdf, f"{key}.urdf")
     lacking = massless(urdf)
-    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn)
+    pads = pad_links(spec, urdf)
+    tight = {name: urdf.links[name].collisions for name in pads}
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn, tight=tight)
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
     _lighten_frames(client, body, urdf)
     moving = {name: joint for name, joint in body.joints.items() if joint in body.movable}
@@ -102,10 +109,16 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
     for name, joint in moving.items():
         body.home[joint], body.efforts[joint] = drives.home[name], drives.efforts[name]
         body.speeds[joint] = drives.speeds[name]
-    for name in spec.gripper.joints if spec.gripper else ():
-        link = moving[name]
+    arm = [moving[name] for name in spec.joints]
+    for name, friction in pads.items():
+        link = body.links[name]
+        if friction:
+            client.changeDynamics(number, link, lateralFriction=friction[0], spinningFriction=friction[1])
+        client.changeDynamics(
+            number, link, contactStiffness=PAD_STIFFNESS, contactDamping=PAD_DAMPING, frictionAnchor=True
+        )
         mass, _, moments = client.getDynamicsInfo(number, link)[:3]
-        if mass < FINGER_MASS:
+        if mass < FINGER_MASS and link in moving.values() and link not in arm:
             client.changeDynamics(number, link, mass=FINGER_MASS)
             body.fingers[link] = (mass, moments), (FINGER_MASS, client.getDynamicsInfo(number, link)[2])
     body.base = _root_pose(client, body, spec)
@@ -114,15 +127,16 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
 
 
 @contextmanager
-def loadable_urdf(path: str) -> Iterator[str]:
+def loadable_urdf(path: str, tight: Mapping[str, Sequence[UrdfVisual]] | None = None) -> Iterator[str]:
     """Yield the path of a URDF that PyBullet can load: a temporary copy where meshes are in packages.
 
-    Visual shapes whose meshes are in a package that is not installed are left out.
+    Visual shapes whose meshes are in a package that is not installed are left out. ``tight`` has the collision shapes
+    of links that get no margin: on a finger it would be an error of the width.
     """
     folder = Path(path).resolve().parent
     root = parse_xml(path)
     files = [element for tag in ("mesh", "texture") for element in root.iter(tag) if element.get("filename")]
-    if all(mesh_near(element.get("filename", ""), folder) for element in files):
+    if not tight and all(mesh_near(element.get("filename", ""), folder) for element in files):
         yield path
         return
     for element in files:
@@ -132,14 +146,51 @@ def loadable_urdf(path: str) -> Iterator[str]:
             if not all(Path(mesh.get("filename", "")).is_file() for mesh in visual.iter("mesh")):
                 link.remove(visual)
     with tempfile.TemporaryDirectory() as place:
-        copy = Path(place) / Path(path).name
-        copy.write_bytes(ElementTree.tostring(root, encoding="utf-8"))
-        yield str(copy)
+        for link in root.iter("link"):
+            _tighten(link, (tight or {}).get(link.get("name", ""), ()), Path(place))
+        file = Path(place) / Path(path).name
+        file.write_bytes(ElementTree.tostring(root, encoding="utf-8"))
+        yield str(file)
 
 
-def _load_urdf(client: PyBulletClient, path: str, key: str, *, fixed: bool, scale: float, drawn: bool) -> int:
+def _tighten(link: ElementTree.Element, shapes: Sequence[UrdfVisual], place: Path) -> None:
+    """Take PyBullet's margin off a link's cylinders, and off its meshes, which become hulls in files at ``place``."""
+    for collision, shape in zip(link.findall("collision"), shapes, strict=bool(shapes)):
+        for cylinder in collision.iter("cylinder"):  # in a URDF PyBullet makes a hull of it
+            radius, length = shape.size
+            margin = min(MARGIN, THIN * min(2.0 * radius, length))
+            cylinder.attrib = {"radius": f"{radius - margin:.9g}", "length": f"{length - 2.0 * margin:.9g}"}
+        if shape.shape != "mesh":
+            continue
+        link.remove(collision)
+        for points in mesh_points(shape, sliced=True):
+            file = place / f"{link.get('name')}_{len(link)}.obj"
+            _write_hull(convex_hull(points), file)
+            part = copy.deepcopy(collision)
+            for mesh in part.iter("mesh"):
+                mesh.attrib = {"filename": str(file)}
+            link.append(part)
+
+
+def _write_hull(hull: Hull, file: Path) -> None:
+    """Write an OBJ file of a hull that is smaller by PyBullet's margin."""
+    smaller = without_margin(hull)
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in smaller.points]
+    file.write_text("".join(lines + [f"f {a} {b} {c}\n" for a, b, c in smaller.faces + 1]))
+
+
+def _load_urdf(
+    client: PyBulletClient,
+    path: str,
+    key: str,
+    *,
+    fixed: bool,
+    scale: float,
+    drawn: bool,
+    tight: Mapping[str, Sequence[UrdfVisual]] | None = None,
+) -> int:
     number = -1
-    with loadable_urdf(path) as file, silenced() as captured:
+    with loadable_urdf(path, tight) as file, silenced() as captured:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
             if not drawn:
@@ -195,9 +246,7 @@ def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) ->
     with tempfile.TemporaryDirectory() as place:
         parts = []
         for k, hull in enumerate(hulls if spec.collision else ()):
-            lines = [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in without_margin(hull)]
-            lines += [f"f {a} {b} {c}\n" for a, b, c in hull.faces + 1]
-            (Path(place) / f"{k}.obj").write_text("".join(lines))
+            _write_hull(hull, Path(place) / f"{k}.obj")
             parts.append(f'<collision><geometry><mesh filename="{k}.obj"/></geometry></collision>')
         if drawn and spec.visible:
             size, name, rgba = " ".join([str(spec.scale)] * 3), quoteattr(str(spec.mesh)), " ".join(map(str, spec.rgba))
@@ -225,22 +274,28 @@ def _rpy(axes: NDArray[np.float64]) -> tuple[float, float, float]:
     return roll, math.atan2(-axes[2, 0], math.hypot(axes[2, 1], axes[2, 2])), yaw
 
 
-def without_margin(hull: Hull) -> NDArray[np.float64]:
-    """Return the corners (n, 3) of a hull that is smaller by the margin that PyBullet adds around hulls.
+def without_margin(hull: Hull) -> Hull:
+    """Return a hull that is smaller by the margin that PyBullet adds around hulls; one that is thin keeps some.
 
-    A corner moves along its faces' normals until it is deeper than each by the margin. A hull that is thin keeps some.
+    It is where all faces, moved inwards by the margin, leave room. Seen from a point inside, a plane at the distance d
+    with the normal n is the point n / d of the dual space, and each face of the dual points' hull is a corner.
     """
+    normals, _ = _planes(hull)
+    middle = uniform_solid([hull]).centre
+    heights = normals @ (hull.points - middle).T
+    margin = min(MARGIN, THIN * float(np.ptp(heights, axis=1).min()))
+    normals, distances = _planes(convex_hull(normals / (heights.max(axis=1) - margin)[:, None]))
+    return convex_hull(middle + normals / distances[:, None])
+
+
+def _planes(hull: Hull) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the normals (n, 3) of a hull's faces, and their distances (n,) from the origin; without slivers."""
     corners = hull.points[hull.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
-    heights = np.einsum("fk,nk->fn", normals, hull.points)
-    depth = float((heights.max(axis=1) - heights.min(axis=1)).min())
-    margin = min(MARGIN, THIN * depth)
-    moved: NDArray[np.float64] = hull.points.copy()
-    for k in range(len(moved)):
-        own = normals[(hull.faces == k).any(axis=1)]
-        moved[k] -= margin * np.linalg.lstsq(own, np.ones(len(own)), rcond=1e-2)[0]
-    return moved
+    areas = np.linalg.norm(normals, axis=1)
+    wide = areas > SLIVER * areas.max()
+    normals = normals[wide] / areas[wide, None]
+    return normals, np.einsum("fi,fi->f", normals, corners[wide, 0])
 
 
 def _describe(

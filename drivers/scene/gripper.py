@@ -27,10 +27,12 @@ SETTLE = 0.1
 """Time of standing still after which a motion has ended at any width, s. Slow motions take longer."""
 BLOCKED = 0.25
 """Share of the commanded speed below which fingers, long after the command, count as blocked."""
+SMOOTH = 0.002
+"""Share of the way of the fingers on each side over which the slope of a table of widths is averaged."""
 PRESSING = 0.5
 """Share of the commanded force from which on the fingers count as pressing on something."""
 
-_KEPT = ("target", "force", "stood", "settle", "resting", "speed", "driven")
+_KEPT = ("target", "force", "stood", "settle", "resting", "speed", "driven", "engaged")
 """Attributes that a saved state has."""
 
 W = TypeVar("W", bound=SimulatedWorld)  # type: ignore[type-arg]  # of any kind of body
@@ -40,57 +42,65 @@ B = TypeVar("B", bound=SimulatedBody)
 class FingerTravel:
     """How the joints of a gripper's fingers make its width, and its force their torques.
 
-    Each joint goes its way from closed to open in proportion to the others. Without a table the width is proportional
-    to that way. A torque follows from the force by virtual work along the mean slope of the table, so the force at a
-    width differs from it as much as the slope there does.
+    Each joint goes its way from closed to open in proportion to the others. Speeds and torques follow from those of the
+    width by the slope of the table there: the force on what is held is the commanded one at every width.
     """
 
     def __init__(self, spec: GripperSpec) -> None:
         self._spec = spec
-        n = len(spec.joints)
-        if not spec.opened:  # each joint slides by half the width, and its motor has the whole force
-            self._closed, self._ratios, self._gears = [0.0] * n, [2.0] * n, [1.0] * n
-        else:
-            ways = [far - shut for far, shut in zip(spec.opened, spec.closed, strict=True)]
+        if spec.opened:
             self._closed = list(spec.closed)
-            self._ratios = [spec.width_max / way for way in ways]
-            self._gears = [ratio / n for ratio in self._ratios]
-        self._table = bool(spec.widths)
+            self._ways = [far - shut for far, shut in zip(spec.opened, spec.closed, strict=True)]
+        else:  # each slides by half the width
+            self._closed, self._ways = [0.0] * len(spec.joints), [spec.width_max / 2.0] * len(spec.joints)
+        self._slope = None if len(spec.travel) > 2 else spec.width_at(1.0) - spec.width_at(0.0)
+
+    @property
+    def varies(self) -> bool:
+        """Whether the same speed and force of the width take others of the joints at other widths."""
+        return self._slope is None
 
     def positions(self, width: float) -> list[float]:
         """Return the position of each joint at a width, rad or m."""
-        way = self._spec.width_max * self._spec.travel_at(width) if self._table else width
-        return [shut + way / ratio for shut, ratio in zip(self._closed, self._ratios, strict=True)]
+        share = self._spec.travel_at(width)
+        return [shut + share * way for shut, way in zip(self._closed, self._ways, strict=True)]
 
-    def speeds(self, speed: float) -> list[float]:
-        """Return the greatest speed of each joint, rad/s or m/s, for one of the width, m/s."""
-        return [speed / abs(ratio) for ratio in self._ratios]
+    def speeds(self, speed: float, width: float) -> list[float]:
+        """Return the greatest speed of each joint, rad/s or m/s, for one of the width, m/s, at a width, m."""
+        share = speed / self._slope_at(self._spec.travel_at(width))
+        return [share * abs(way) for way in self._ways]
 
-    def efforts(self, force: float) -> list[float]:
-        """Return the greatest torque or force of each joint, Nm or N, for a force of the fingers, N."""
-        return [force * abs(gear) for gear in self._gears]
+    def efforts(self, force: float, width: float) -> list[float]:
+        """Return the greatest torque or force of each joint, Nm or N, for a force of the fingers, N, at a width, m."""
+        work = force * self._slope_at(self._spec.travel_at(width)) / len(self._ways)
+        return [work / abs(way) for way in self._ways]
 
     def reading(
         self, positions: Sequence[float], speeds: Sequence[float], efforts: Sequence[float]
     ) -> tuple[float, float, float, float]:
         """Return width, its speed and the two forces of :meth:`SimulatedGripper._width` for what the joints have."""
-        n = len(positions)
-        way = sum([r * (p - c) for r, p, c in zip(self._ratios, positions, self._closed, strict=True)]) / n
-        speed = sum([r * v for r, v in zip(self._ratios, speeds, strict=True)]) / n
-        forces = [effort / gear for effort, gear in zip(efforts, self._gears, strict=True)]
-        if self._table:
-            share = way / self._spec.width_max
-            way = self._spec.width_at(share)
-            speed *= (self._spec.width_at(share + 1e-3) - way) / (1e-3 * self._spec.width_max)
-        return way, speed, -max(forces), max(map(abs, forces))
+        n, ways = len(positions), self._ways
+        share = sum([(p - c) / way for p, c, way in zip(positions, self._closed, ways, strict=True)]) / n
+        slope = self._slope_at(share)
+        speed = slope * sum([v / way for v, way in zip(speeds, ways, strict=True)]) / n
+        forces = [effort * way * n / slope for effort, way in zip(efforts, ways, strict=True)]
+        return self._spec.width_at(share), speed, -max(forces), max(map(abs, forces))
+
+    def _slope_at(self, share: float) -> float:
+        """Return the change of the width per share of the way, m, around a share of it; the table is linear there."""
+        if self._slope is not None:
+            return self._slope
+        low, high = max(share - SMOOTH, 0.0), min(share + SMOOTH, 1.0)
+        if low >= high:  # fingers beyond their ends
+            low, high = (0.0, SMOOTH) if share < 0.5 else (1.0 - SMOOTH, 1.0)
+        return (self._spec.width_at(high) - self._spec.width_at(low)) / (high - low)
 
 
 class SimulatedGripper(GripperDriver, Generic[W, B]):
     """Base class of the driver of the fingers of one robot in a simulated world.
 
-    Each finger is driven by a position motor whose force is the grip force, so a grasp needs no code per step: on an
-    object the motors press with that force, from both sides, until the next command. All fingers are one drive: none
-    can be moved, or stopped, alone.
+    Each finger is driven by a position motor whose force is the grip force: on an object the motors press with that
+    force, from both sides, until the next command. All fingers are one drive: none can be moved, or stopped, alone.
     """
 
     simulated: ClassVar[bool] = True
@@ -118,6 +128,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._speed = spec.speed
         self._driven: float | None = None
         """Speed of the motion that the motors make, m/s; None while they hold since a reset."""
+        self._engaged = True
+        """Whether the fingers move or hold something."""
         self._placed = (0, 0.0, 0.0)
         """The step at which a reset or a restored state placed the fingers, and the force and the load (N) that are
         measured until the next one: the engine may still have those of before."""
@@ -136,7 +148,11 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     @abstractmethod
     def _drive(self, speed: float) -> None:
-        """Drive the fingers to the width :attr:`_target` with :attr:`_force`; ``speed`` is that of the width, m/s."""
+        """Drive the fingers to the width :attr:`_target` with :attr:`_force`; ``speed`` is that of the width, m/s.
+
+        Where the travel :attr:`~FingerTravel.varies`, it is called before every step while the fingers move or hold
+        something: what the joints need follows from the present width.
+        """
 
     @abstractmethod
     def _handle(self, active: bool) -> None:
@@ -158,6 +174,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         if not self._open:
             self._world.on_reset(self._body.name, self._was_reset)
             self._world.keep(f"{self._body.name}.gripper", self._save, self._restore)
+            if self._travel.varies:
+                self._world.before_steps(f"{self._body.name}.gripper", self._drive_on)
         self._open = True
 
     def read(self, now: float) -> GripperReading:
@@ -169,7 +187,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         moving = not self._at_rest(width, speed)
         pressing = force >= PRESSING * self._force
         idle = not moving and abs(width - self._target) <= AT_TARGET and load < PRESSING * self._force
-        self._handle(not idle)
+        self._engage(not idle)
         return GripperReading(
             t=now,
             t_device=self._world.t,
@@ -191,8 +209,17 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def move(self, width: float, speed: float, force: float) -> None:
         """Start a motion to ``width``, clipped to the gripper's range; the newest command wins."""
-        self._target = min(max(width, 0.0), self.spec.width_max)
+        self._target = min(max(width, self.spec.width_min), self.spec.width_max)
         self._start(speed, force)
+
+    def _engage(self, active: bool) -> None:
+        """Take notice whether the fingers move or hold something."""
+        self._engaged = active
+        self._handle(active)
+
+    def _drive_on(self) -> None:
+        if self._engaged and self._driven is not None:
+            self._drive(self._driven)
 
     def _expect_open(self) -> None:
         if not self._open:
@@ -204,7 +231,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._speed = min(speed, self.spec.speed)
         self._resting, self._stood_since = False, self._world.steps
         self._settle = max(SETTLE, 2.0 * STILL / self._speed)
-        self._handle(True)
+        self._engage(True)
         self._driven = self._speed
         self._drive(self._driven)
 
@@ -230,7 +257,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
             return
         self._target = width
-        self._handle(True)
+        self._engage(True)
         self._driven = self.spec.speed
         self._drive(self._driven)
 
@@ -238,6 +265,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         """Disconnect; the motors hold, or press, for as long as the world exists."""
         if self._open:
             self._world.off_reset(self._body.name, self._was_reset)
+            self._world.before_steps(f"{self._body.name}.gripper", None)
         self._open = False
 
     def _save(self) -> dict[str, Any]:

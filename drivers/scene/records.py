@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from hal.errors import ConfigError, Problem
 from hal.kinematics.hulls import Hull, mesh_hulls
-from hal.kinematics.urdf import UrdfMimic, UrdfModel
+from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml
 from hal.specs import BodySpec, GripperSpec, RobotSpec
 
 from .values import listed
@@ -20,11 +20,14 @@ __all__ = [
     "hulls_of",
     "joint_drives",
     "mimics_of",
+    "pad_links",
     "required",
 ]
 
 SHAPES = "box, sphere, cylinder, capsule, plane, mesh, urdf"
 """Shapes of objects, for messages."""
+PAD_FRICTION = (1.0, 0.1)
+"""Lateral and spinning friction of a gripper's pads: rubber."""
 UNKNOWN_EFFORT = 200.0
 """Effort, Nm or N, of a joint without a limit (a URDF's effort of 0 means unknown, not powerless)."""
 UNKNOWN_SPEED = 2.0
@@ -132,6 +135,27 @@ def followers_of(spec: RobotSpec, urdf: UrdfModel) -> tuple[UrdfMimic, ...]:
     fingers = spec.gripper.joints if spec.gripper else ()
     driven = {*fingers, *spec.joints}
     return tuple(one for one in mimics_of(spec, urdf) if one.of in fingers and one.joint not in driven)
+
+
+def pad_links(spec: BodySpec | RobotSpec, urdf: UrdfModel) -> dict[str, tuple[float, float] | None]:
+    """Return the links that the gripper holds things with, and their lateral and spinning friction.
+
+    They are its fingers; a single jaw closes on the link that carries it. The friction is that of rubber
+    (:data:`PAD_FRICTION`); None where the file has a ``<contact>`` of its own.
+    """
+    if not isinstance(spec, RobotSpec) or spec.gripper is None:
+        return {}
+    fingers = spec.gripper.joints
+    moved = {*fingers, *(one.joint for one in followers_of(spec, urdf))}
+    pads = {link for link in urdf.links if any(joint.name in moved for joint in urdf.above(link))}
+    if len(moved) == 1:
+        pads.add(urdf.joints[fingers[0]].parent)
+    given = {link.get("name") for link in parse_xml(urdf.path).findall("link") if link.find("contact") is not None}
+    return {
+        name: None if name in given else PAD_FRICTION
+        for name, link in urdf.links.items()
+        if name in pads and link.collisions
+    }
 
 
 def mimics_of(spec: BodySpec | RobotSpec, urdf: UrdfModel) -> tuple[UrdfMimic, ...]:

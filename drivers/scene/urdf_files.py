@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hal.errors import ConfigError, Problem
+from hal.kinematics.hulls import mesh_parts
 from hal.kinematics.mesh_files import mesh_file, package_folder
 from hal.kinematics.urdf import UrdfLink, UrdfModel, UrdfVisual, parse_xml, read_urdf
 from hal.specs import BodySpec
 
-__all__ = ["absent_packages", "checked_urdf", "drawn_visuals", "has_free_base", "massless"]
+__all__ = ["absent_packages", "checked_urdf", "drawn_visuals", "has_free_base", "massless", "mesh_points"]
+
+HOLLOW, SLICES = 0.5, 10
+"""Share of its hull that a finger's mesh must fill to collide as one hull, and how many slices it is cut into else."""
 
 
 def checked_urdf(path: str, key: str) -> UrdfModel:
@@ -109,3 +118,50 @@ def _absent(name: str) -> str:
         return ""
     package = name.removeprefix("package://").partition("/")[0]
     return package if package_folder(package) is None else ""
+
+
+def mesh_points(shape: UrdfVisual, *, sliced: bool = False) -> Iterator[NDArray[np.float64]]:
+    """Yield the points (n, 3), m, of each part of a link's mesh that collides with a hull of its own.
+
+    Args:
+        shape: The mesh. The parts of an OBJ are its objects and groups, as in PyBullet; others have one part.
+        sliced: Cut a part that fills less than half of its hull, as a bent finger does, across its longest side.
+
+    Raises:
+        ValueError: The mesh cannot be read, or a part of it is flat.
+    """
+    file = Path(shape.file)
+    scale = np.array(shape.size)
+    for points in mesh_parts(file) if file.suffix.lower() == ".obj" else _solid_parts(file, sliced):
+        points = np.unique(points * scale, axis=0)
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 3 else np.zeros(3)
+        if spread[2] <= 1e-6 * max(spread[0], 1e-9):
+            raise ValueError(f"mesh {file.name} is flat, and has no hull; use a thin box as its collision shape")
+        yield points
+
+
+def _solid_parts(file: Path, sliced: bool) -> list[NDArray[np.float64]]:
+    import trimesh  # 0.3 s
+
+    try:
+        mesh: Any = trimesh.load(str(file), force="mesh")
+        points = np.array(mesh.vertices, dtype=np.float64)
+        if not sliced or mesh.volume >= HOLLOW * mesh.convex_hull.volume:
+            return [points]
+        edges = points[mesh.edges_unique]
+    except Exception as error:  # whatever the reader of that format raises
+        raise ValueError(f"mesh {file.name} cannot be read: {error}") from None
+    axis = int(np.ptp(points, axis=0).argmax())
+    planes = np.linspace(points[:, axis].min(), points[:, axis].max(), SLICES + 1)
+    cuts = [_cut(edges, axis, plane) for plane in planes]
+    within = [points[(points[:, axis] >= low) & (points[:, axis] <= high)] for low, high in itertools.pairwise(planes)]
+    return [np.concatenate(part) for part in zip(within, cuts[:-1], cuts[1:], strict=True)]
+
+
+def _cut(edges: NDArray[np.float64], axis: int, plane: float) -> NDArray[np.float64]:
+    """Return where edges (n, 2, 3) pass a plane across an axis."""
+    a, b = edges[:, 0], edges[:, 1]
+    passing = (a[:, axis] - plane) * (b[:, axis] - plane) < 0.0
+    a, way = a[passing], (b - a)[passing]
+    crossed: NDArray[np.float64] = a + way * ((plane - a[:, axis]) / way[:, axis])[:, None]
+    return crossed

@@ -60,6 +60,7 @@ class SimulatedWorld(SceneEngine[B]):
         self._gravity = list(spec.gravity)
         self._on_reset: dict[str, list[Callable[[], None]]] = {}
         self._on_edit: list[Callable[[str, dict[str, Any], int], None]] = []
+        self._before_steps: dict[str, Callable[[], None]] = {}
         self._kept: dict[str, tuple[Callable[[], Any], Callable[[Any], None]]] = {}
         """How the states of drivers are saved and restored."""
 
@@ -544,6 +545,13 @@ class SimulatedWorld(SceneEngine[B]):
 
     def keep(self, name: str, save: Callable[[], Any], restore: Callable[[Any], None]) -> None:
         self._kept[name] = save, restore
+
+    def before_steps(self, name: str, callback: Callable[[], None] | None) -> None:
+        """Call ``callback`` before each step, in place of that of the same name; None ends it."""
+        if callback is not None:
+            self._before_steps[name] = callback
+        else:
+            self._before_steps.pop(name, None)
 
     def on_edit(self, callback: Callable[[str, dict[str, Any], int], None]) -> None:
         self._on_edit.append(callback)

@@ -437,7 +437,7 @@ def _robot_message(robot: RobotSpec) -> dict[str, Any]:
         "lower": list(robot.limits.lower),
         "upper": list(robot.limits.upper),
         "velocity": list(robot.limits.velocity),
-        "width_max": robot.gripper.width_max if robot.gripper is not None else None,
+        "widths": [robot.gripper.width_min, robot.gripper.width_max] if robot.gripper is not None else None,
     }
 
 

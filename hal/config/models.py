@@ -113,7 +113,7 @@ class FingerModel(Strict):
     open: FingerPosition | None = None
     """Position at the greatest width, rad or m."""
     closed: FingerPosition | None = None
-    """Position at width 0, rad or m."""
+    """Position when closed, rad or m."""
 
     @model_validator(mode="before")
     @classmethod

@@ -177,17 +177,17 @@ class GripperUnit:
         if reading.outcome:
             self._outcome = reading.outcome
         elif not reading.moving and reading.seq != self._seq_before:
-            self._end(_judge_rest(command, reading))
+            self._end(_judge_rest(command, reading, self.spec.width_min))
 
     def close(self) -> None:
         """Close the device; it keeps what it holds."""
         self.driver.close()
 
 
-def _judge_rest(command: GripperCommand, reading: GripperReading) -> GripperOutcome:
+def _judge_rest(command: GripperCommand, reading: GripperReading, width_min: float) -> GripperOutcome:
     beyond = reading.width - command.width
     if command.act is GripperAct.MOVE:
-        there = abs(beyond) <= AT_WIDTH
+        there = abs(reading.width - max(command.width, width_min)) <= AT_WIDTH
     elif command.act is GripperAct.GRASP:
         there = -command.inner <= beyond <= command.outer and reading.grasped is not False
     else:

@@ -21,6 +21,7 @@ from ..errors import DeviceNotFound, NotSupported, PolicyError, Unreachable
 from ..geometry import Pose, apply_rotation, difference, quaternion_to_matrix
 
 if TYPE_CHECKING:
+    from ..gripper import Gripper
     from ..observation import Observation
     from ..rig import Rig
     from ..robot import Robot
@@ -116,14 +117,14 @@ class GripperAction(Strict):
     threshold: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     """Share of the way to closed from which the gripper closes, and below which it opens; None: in proportion."""
 
-    def values(self, grips: Array, width_max: float) -> Array:
+    def values(self, grips: Array, gripper: Gripper) -> Array:
         """Return the values of the action (k,) for grips (k,), 0 open to 1 closed; the reverse of :meth:`grip`."""
-        opened, closed = (width_max, 0.0) if self.metres else (self.open, self.closed)
+        opened, closed = (gripper.width_max, gripper.width_min) if self.metres else (self.open, self.closed)
         return opened + grips * (closed - opened)
 
-    def grip(self, values: Array, width_max: float) -> Array:
-        """Return the grips (k,), 0 open to 1 closed, for values of the action (k,) and a gripper of this width, m."""
-        opened, closed = (width_max, 0.0) if self.metres else (self.open, self.closed)
+    def grip(self, values: Array, gripper: Gripper) -> Array:
+        """Return the grips (k,), 0 open to 1 closed, for values of the action (k,)."""
+        opened, closed = (gripper.width_max, gripper.width_min) if self.metres else (self.open, self.closed)
         share = np.clip((values - opened) / (closed - opened), 0.0, 1.0)
         return share if self.threshold is None else (share >= self.threshold).astype(float)
 
@@ -189,7 +190,7 @@ class ActionConfig(Strict):
         state, grip = observation.robots[robot.name], None
         if self.gripper is not None:
             assert robot.gripper is not None
-            grip = self.gripper.grip(actions[:, self.gripper.index], robot.gripper.width_max)
+            grip = self.gripper.grip(actions[:, self.gripper.index], robot.gripper)
             actions = np.delete(actions, self.gripper.index, axis=1)
         if self.kind in _SUMMED:
             scales = [*[self.scale] * 3, *[self.turn] * 3] if self.kind == "tcp_delta" else self.scale
@@ -222,7 +223,7 @@ class ActionConfig(Strict):
             return rows
         assert robot.gripper is not None
         assert targets.grip is not None
-        values = self.gripper.values(targets.grip, robot.gripper.width_max)
+        values = self.gripper.values(targets.grip, robot.gripper)
         return np.insert(rows, self.gripper.index % (rows.shape[1] + 1), values, axis=1)
 
     def _add_steps(self, actions: Array, q: Array, robot: Robot, period: float) -> Array:
@@ -481,8 +482,8 @@ def _read_state(name: str, observation: Observation, robot: Robot) -> Array:
     if name == "width":
         return np.array([width])
     assert robot.gripper is not None
-    share = float(np.clip(width / robot.gripper.width_max, 0.0, 1.0))
-    return np.array([share if name == "open" else 1.0 - share])
+    grip = robot.gripper.grip_at(width)
+    return np.array([1.0 - grip if name == "open" else grip])
 
 
 def _fit_picture(color: NDArray[np.uint8], source: Source) -> NDArray[np.uint8]:

@@ -220,7 +220,7 @@ def touch(run: SkillRun, force: float, speed: float) -> float:
 
     run.close_fingers(lambda: gripper.start(0.0, min(speed, gripper.spec.speed), force), is_pressed)
     width = gripper.state().width
-    if width <= NOTHING:
+    if width <= gripper.width_min + NOTHING:
         run.fail("missed", f"{gripper.name} closed on nothing")
     return width
 
@@ -229,7 +229,8 @@ def close_on(run: SkillRun, width: float | None, force: float | None) -> None:
     """Close the fingers on an object of this width, m; None if it is unknown."""
     run.begin("close")
     gripper = run.gripper
-    least = NOTHING if width is None else max(NOTHING, width - TOLERANCE)
+    nothing = gripper.width_min + NOTHING
+    least = nothing if width is None else max(nothing, width - TOLERANCE)
     most = gripper.width_max if width is None else width + TOLERANCE
     middle = 0.5 * (least + most)
     expected = min(middle, gripper.width_max)
@@ -240,7 +241,7 @@ def close_on(run: SkillRun, width: float | None, force: float | None) -> None:
     rests = result.state.width
     if result or (result.state.grasped and least < rests < most):
         return
-    if rests <= NOTHING:
+    if rests <= nothing:
         run.fail("missed", f"{gripper.name} closed on nothing")
     wanted = "" if width is None else f" instead of {width:.3f} m"
     text = f"{gripper.name} closed on something that is {rests:.3f} m wide{wanted}"

@@ -48,6 +48,7 @@ from .benches import (  # noqa: E402
 from .camera import CameraContract  # noqa: E402
 from .gamepad import GamepadContract  # noqa: E402
 from .gripper import GripperContract  # noqa: E402
+from .holding import HoldResult, hold_object  # noqa: E402
 from .robot import RobotContract  # noqa: E402
 from .world import WorldContract  # noqa: E402
 from .world_bench import WorldBench  # noqa: E402
@@ -60,6 +61,7 @@ __all__ = [
     "GamepadContract",
     "GripperBench",
     "GripperContract",
+    "HoldResult",
     "PadBench",
     "RobotBench",
     "RobotContract",
@@ -68,6 +70,7 @@ __all__ = [
     "bench_of",
     "camera_spec",
     "gripper_spec",
+    "hold_object",
     "needs",
     "pad_spec",
     "robot_spec",

@@ -116,7 +116,8 @@ export class ArmPanel {
     this.picked = () => {};
   }
 
-  #gripMax = /** @type {number | null} */ (null);
+  /** Least and greatest width of the gripper, m. */
+  #widths = /** @type {[number, number] | null} */ (null);
 
   /** @param {any[]} robots of hello */
   open(robots) {
@@ -133,7 +134,7 @@ export class ArmPanel {
     const robot = this.robots.find((one) => one.name === name);
     if (!robot || name === this.name) return;
     this.name = name;
-    this.#gripMax = robot.width_max;
+    this.#widths = robot.widths;
     choose(byId("robots"), name);
     setText(byId("model"), robot.name);
     byId("model").title = `${robot.name}: ${robot.model}, ${robot.driver}, ${robot.real ? "a real arm" : "simulated"}`;
@@ -155,8 +156,9 @@ export class ArmPanel {
   /** Return how far the gripper is closed, 0..1, or null. @param {any} state */
   closed(state) {
     const gripper = state?.robots[this.name]?.gripper;
-    if (!gripper || !this.#gripMax || typeof gripper.width !== "number") return null;
-    return Math.min(1, Math.max(0, 1 - gripper.width / this.#gripMax));
+    if (!gripper || !this.#widths || typeof gripper.width !== "number") return null;
+    const [least, most] = this.#widths;
+    return Math.min(1, Math.max(0, (most - gripper.width) / (most - least)));
   }
 
   /** Show a state; ten times a second. @param {any} state @param {number} silent ms since it came */

@@ -196,16 +196,18 @@ def test_a_policy_of_two_arms_sees_and_moves_each_by_its_own_numbers() -> None:
         policy.close()
         assert (outcome.ended, outcome.reason) == ("time", "")
         moved = {name: arm.state().q - before[name] for name, arm in rig.robots.items()}
-        widths = {
-            name: arm.gripper.state().width / arm.gripper.width_max for name, arm in rig.robots.items() if arm.gripper
+        opened = {
+            name: 1.0 - arm.gripper.grip_at(arm.gripper.state().width)
+            for name, arm in rig.robots.items()
+            if arm.gripper
         }
         assert_within_limits(rig)
     assert moved["left"][0] > 0.1
     assert moved["right"][1] < -0.1
     assert np.abs(np.delete(moved["left"], 0)).max() < 1e-6
     assert np.abs(np.delete(moved["right"], 1)).max() < 1e-6
-    assert widths["left"] > 0.95
-    assert widths["right"] < 0.05
+    assert opened["left"] > 0.95
+    assert opened["right"] < 0.05
     first = requests[0]
     assert {picture.shape for picture in first["images"].values()} == {(3, 224, 224)}
     assert sorted(first["images"]) == ["cam_high", "cam_left_wrist", "cam_low", "cam_right_wrist"]

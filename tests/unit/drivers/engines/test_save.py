@@ -147,7 +147,7 @@ def test_fingers_have_the_forces_of_the_restored_state_before_the_next_step(benc
     idle, there = bench.gripper.read(0.0), bench.world.save()
     first = bench.run(30, False)
     bench.gripper.grasp(0.0, 0.2, 20.0, 0.01, 0.01)
-    bench.run(1, False)
+    bench.run(2, False)
     pressing, held = bench.gripper.read(0.0), bench.world.save()
     assert abs(pressing.force - idle.force) > 1.0
     bench.world.restore(there)
