@@ -117,7 +117,7 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
 def loadable_urdf(path: str) -> Iterator[str]:
     """Yield the path of a URDF that PyBullet can load: a temporary copy where meshes are in packages.
 
-    Visual shapes whose meshes are in a package that is not installed are left out.
+    Meshes in a package that is not installed are left out, and with its last one the visual shape.
     """
     folder = Path(path).resolve().parent
     root = parse_xml(path)
@@ -128,9 +128,12 @@ def loadable_urdf(path: str) -> Iterator[str]:
     for element in files:
         element.set("filename", str(mesh_file(element.get("filename", ""), folder)))
     for link in root.iter("link"):
-        for visual in link.findall("visual"):
-            if not all(Path(mesh.get("filename", "")).is_file() for mesh in visual.iter("mesh")):
-                link.remove(visual)
+        for owner in (*link.findall("visual"), *link.findall("collision")):
+            for geometry in owner.findall("geometry"):
+                shapes = [one for one in geometry if one.tag != "mesh" or Path(one.get("filename", "")).is_file()]
+                if len(geometry) and not shapes:
+                    link.remove(owner)
+                geometry[:] = shapes
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / Path(path).name
         copy.write_bytes(ElementTree.tostring(root, encoding="utf-8"))
