@@ -130,8 +130,8 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
 def loadable_urdf(path: str, tight: Mapping[str, Sequence[UrdfVisual]] | None = None) -> Iterator[str]:
     """Yield the path of a URDF that PyBullet can load: a temporary copy where meshes are in packages.
 
-    Visual shapes whose meshes are in a package that is not installed are left out. ``tight`` has the collision shapes
-    of links that get no margin: on a finger it would be an error of the width.
+    Meshes in a package that is not installed are left out, and with its last one the visual shape. ``tight`` has the
+    collision shapes of links that get no margin: on a finger it would be an error of the width.
     """
     folder = Path(path).resolve().parent
     root = parse_xml(path)
@@ -142,9 +142,12 @@ def loadable_urdf(path: str, tight: Mapping[str, Sequence[UrdfVisual]] | None = 
     for element in files:
         element.set("filename", str(mesh_file(element.get("filename", ""), folder)))
     for link in root.iter("link"):
-        for visual in link.findall("visual"):
-            if not all(Path(mesh.get("filename", "")).is_file() for mesh in visual.iter("mesh")):
-                link.remove(visual)
+        for owner in (*link.findall("visual"), *link.findall("collision")):
+            for geometry in owner.findall("geometry"):
+                shapes = [one for one in geometry if one.tag != "mesh" or Path(one.get("filename", "")).is_file()]
+                if len(geometry) and not shapes:
+                    link.remove(owner)
+                geometry[:] = shapes[:1]
     with tempfile.TemporaryDirectory() as place:
         for link in root.iter("link"):
             _tighten(link, (tight or {}).get(link.get("name", ""), ()), Path(place))

@@ -20,7 +20,7 @@ from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfModel
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
 from .shapes import Visual
-from .urdf_files import absent_packages, checked_urdf, drawn_visuals, has_free_base
+from .urdf_files import absent_packages, checked_urdf, drawn_visuals, has_free_base, where_to_get
 from .values import body_spec, nearest
 
 __all__ = ["DrawnBody", "DrawnWorld"]
@@ -126,7 +126,7 @@ class DrawnWorld:
     def notes(self) -> list[str]:
         """Messages for the user: what is not drawn as its file describes it."""
         return [
-            f"{', '.join(names)}: drawn by collision shapes, as the meshes are in {package}, which is not installed"
+            f"{', '.join(names)}: drawn with plain shapes; the meshes are in {where_to_get(package)}"
             for package, names in self._absent.items()
         ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,19 @@ from numpy.typing import NDArray
 
 from hal.errors import ConfigError, Problem
 from hal.kinematics.hulls import mesh_parts
-from hal.kinematics.mesh_files import mesh_file, package_folder
+from hal.kinematics.mesh_files import PACKAGE, mesh_file, package_folder
 from hal.kinematics.urdf import UrdfLink, UrdfModel, UrdfVisual, parse_xml, read_urdf
 from hal.specs import BodySpec
 
-__all__ = ["absent_packages", "checked_urdf", "drawn_visuals", "has_free_base", "massless", "mesh_points"]
+__all__ = [
+    "absent_packages",
+    "checked_urdf",
+    "drawn_visuals",
+    "has_free_base",
+    "massless",
+    "mesh_points",
+    "where_to_get",
+]
 
 HOLLOW, SLICES = 0.5, 10
 """Share of its hull that a finger's mesh must fill to collide as one hull, and how many slices it is cut into else."""
@@ -40,7 +49,12 @@ def checked_urdf(path: str, key: str) -> UrdfModel:
         raise ConfigError([Problem(path, key, f"cannot be read: {error.strerror}", "missing_file")]) from None
     except ValueError as error:
         raise ConfigError([Problem(path, key, str(error), "bad_urdf")]) from None
-    missing = [name for name, drawn in _missing_meshes(path) if not (drawn and _absent(name))]
+    folder = Path(path).resolve().parent
+    missing = [
+        _file_name(shapes[0])
+        for shapes, drawn in _mesh_shapes(path)
+        if not any(_exists(one, folder) for one in shapes) and not (drawn and _absent(_file_name(shapes[0])))
+    ]
     if missing:
         raise ConfigError(
             [_missing(path, key, name) for name in {_absent(name) or name: name for name in missing}.values()]
@@ -53,18 +67,29 @@ def _missing(path: str, key: str, mesh: str) -> Problem:
     package = _absent(mesh)
     if not package:
         return Problem(path, key, f"names a mesh that does not exist: {mesh}", "missing_file")
+    return Problem(path, key, f"its meshes are in {where_to_get(package)}", "missing_package")
+
+
+def where_to_get(package: str) -> str:
+    """Return the words about a package that is not installed: its name, and the command that installs it."""
     from hal.config.context import INSTALL
 
     command = INSTALL.get(package, f"pip install {package.replace('_', '-')}")
-    return Problem(
-        path, key, f"its meshes are in package {package!r}, which is not installed; {command}", "missing_package"
-    )
+    return f"package {package!r}, which is not installed; {command}"
 
 
 def absent_packages(path: str) -> tuple[str, ...]:
-    """Return the packages that a URDF's visual meshes are in and that are not installed."""
-    names = [_absent(name) for name, drawn in _missing_meshes(path) if drawn]
-    return tuple(dict.fromkeys(name for name in names if name))
+    """Return the packages that a URDF's visual meshes are in and that are not installed.
+
+    Of several alternatives the last is a plain shape: if that is drawn, the package of the first is returned.
+    """
+    folder = Path(path).resolve().parent
+    found = dict.fromkeys(
+        _absent(_file_name(shapes[0]))
+        for shapes, drawn in _mesh_shapes(path)
+        if drawn and not any(_exists(one, folder) for one in shapes[:-1] or shapes)
+    )
+    return tuple(name for name in found if name)
 
 
 def drawn_visuals(link: UrdfLink) -> tuple[UrdfVisual, ...]:
@@ -101,22 +126,28 @@ def massless(urdf: UrdfModel) -> tuple[str, ...]:
     return tuple(link.name for link in urdf.links.values() if link.inertial is None and link.has_shapes)
 
 
-def _missing_meshes(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield the name of each mesh that does not exist, and whether it is only drawn."""
-    folder = Path(path).resolve().parent
+def _mesh_shapes(path: str) -> Iterator[tuple[list[ElementTree.Element], bool]]:
+    """Yield the alternatives of each shape whose first one is a mesh, and whether it is only drawn."""
     for link in parse_xml(path).iter("link"):
-        for shape in link:
-            for mesh in shape.iter("mesh"):
-                name = mesh.get("filename", "")
-                if not mesh_file(name, folder).is_file():
-                    yield name, shape.tag == "visual"
+        for owner in link:
+            shapes = [shape for geometry in owner.iter("geometry") for shape in geometry]
+            if shapes and shapes[0].tag == "mesh":
+                yield shapes, owner.tag == "visual"
+
+
+def _exists(shape: ElementTree.Element, folder: Path) -> bool:
+    return shape.tag != "mesh" or mesh_file(_file_name(shape), folder).is_file()
+
+
+def _file_name(shape: ElementTree.Element) -> str:
+    return shape.get("filename", "")
 
 
 def _absent(name: str) -> str:
     """Return the package of a mesh if that package is not installed, else an empty text."""
-    if not name.startswith("package://"):
+    if not name.startswith(PACKAGE):
         return ""
-    package = name.removeprefix("package://").partition("/")[0]
+    package = name.removeprefix(PACKAGE).partition("/")[0]
     return package if package_folder(package) is None else ""
 
 

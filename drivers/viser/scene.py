@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
 from hal.drivers.scene.drawn import DrawnWorld
-from hal.drivers.scene.urdf_files import absent_packages, drawn_visuals
+from hal.drivers.scene.urdf_files import absent_packages, drawn_visuals, where_to_get
 from hal.errors import HalError
 from hal.geometry import Pose
 from hal.host.memory import SeriesBox
@@ -303,11 +303,11 @@ def _read_urdf(path: str) -> UrdfModel:
 
 
 def shown_visuals(urdf: UrdfModel, notes: list[str]) -> dict[str, tuple[UrdfVisual, ...]]:
-    """Return what is drawn of each link: its visuals, or collision shapes where their package is not installed."""
+    """Return what is drawn of each link, with a note for each package of meshes that is not installed."""
     absent = absent_packages(str(urdf.path))
     if not absent:
         return {name: link.visuals for name, link in urdf.links.items()}
-    notes.append(f"{urdf.path.name}: drawn by its collision shapes; not installed: {', '.join(absent)}")
+    notes += [f"{urdf.path.name}: drawn with plain shapes; its meshes are in {where_to_get(name)}" for name in absent]
     return {name: drawn_visuals(link) for name, link in urdf.links.items()}
 
 

@@ -182,12 +182,13 @@ _NO_WHEEL = (
     "it is a part of PyBullet, which has no wheel for "
     f"Python {platform.python_version()} on {sys.platform} {platform.machine()}. Use Python 3.11 on x86-64 Linux "
     "(uv venv --seed --python 3.11 .venv, then install again), or build it (C++ compiler): pip install pybullet. "
-    "The Panda, the FR3 and the built-in objects do not need it"
+    "No built-in model or object needs it"
 )
 INSTALL = {
     "pybullet_data": "pip install pybullet" if _HAS_WHEEL else _NO_WHEEL,
     "example_robot_data": "pip install 'robot-hal[robots]'",
     "airo_models": "pip install 'robot-hal[robots]'",
+    "franky_sim": "pip install 'robot-hal[robots]'",
     "rtbdata": "pip install 'robot-hal[robots]'",
 }
 """The command that installs a package, where it is not ``pip install`` and the package's name."""

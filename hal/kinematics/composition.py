@@ -14,7 +14,7 @@ from math import atan2, hypot
 from pathlib import Path
 
 from ..geometry import Pose
-from .mesh_files import mesh_file
+from .mesh_files import PACKAGE, mesh_file
 from .urdf import UrdfModel, parse_xml
 
 __all__ = ["MountedTool", "compose_urdf", "divide_urdf"]
@@ -117,8 +117,10 @@ def _with_absolute_files(urdf: Path) -> ElementTree.Element:
     folder = urdf.resolve().parent
     for tag in ("mesh", "texture"):
         for element in root.iter(tag):
-            if element.get("filename"):
-                element.set("filename", str(mesh_file(element.get("filename", ""), folder).resolve()))
+            name = element.get("filename", "")
+            file = mesh_file(name, folder)
+            if name and (file.is_file() or not name.startswith(PACKAGE)):  # else its package is not installed
+                element.set("filename", str(file.resolve()))
     return root
 
 

@@ -19,10 +19,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["check_mesh", "hull_points", "is_installed", "mesh_file", "mesh_near", "package_folder"]
+__all__ = ["PACKAGE", "check_mesh", "hull_points", "is_installed", "mesh_file", "mesh_near", "package_folder"]
 
-_PACKAGE = "package://"
-_SCHEMES = (_PACKAGE, "model://", "file://")
+PACKAGE = "package://"
+"""Begins the name of a file in an installed package."""
+_SCHEMES = (PACKAGE, "model://", "file://")
 
 
 def package_folder(package: str) -> Path | None:
@@ -60,7 +61,7 @@ def mesh_file(name: str, folder: Path) -> Path:
         return found
     plain = _plain(name)
     package, _, rest = plain.partition("/")
-    if name.startswith(_PACKAGE) and package.isidentifier():
+    if name.startswith(PACKAGE) and package.isidentifier():
         root = package_folder(package)
         if root is not None and (root / rest).is_file():
             return root / rest

@@ -425,12 +425,22 @@ def _link(element: ElementTree.Element, colors: _Colors, files: Mapping[str, Pat
     )
 
 
+def _first_existing(geometry: ElementTree.Element, files: Mapping[str, Path]) -> ElementTree.Element | None:
+    """Return the first shape in a ``<geometry>`` that is no mesh, or whose file exists; else the first, if it has one.
+
+    Several shapes are alternatives. That is an addition to URDF: other readers take the first.
+    """
+    shapes = list(geometry)
+    found = (one for one in shapes if one.tag != "mesh" or files[one.get("filename", "")].is_file())
+    return next(found, next(iter(shapes), None))
+
+
 def _shape(element: ElementTree.Element, colors: _Colors, files: Mapping[str, Path]) -> UrdfVisual | None:
     material, geometry = element.find("material"), element.find("geometry")
     rgba = colors.get(material.get("name", "")) if material is not None else None
     if material is not None and (own := material.find("color")) is not None:
         rgba = _floats(own, "rgba", (1.0, 1.0, 1.0, 1.0))
-    shape = next(iter(geometry), None) if geometry is not None else None
+    shape = _first_existing(geometry, files) if geometry is not None else None
     if shape is None:
         return None
     pose = _origin(element)

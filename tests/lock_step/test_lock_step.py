@@ -165,8 +165,6 @@ def test_what_a_simulation_changes_of_a_new_body_is_a_note(rig: hal.Rig, tmp_pat
 
 @pytest.mark.parametrize("name", ["iiwa_table", "yam", "yam_emulator", "piper", "piper_emulator", "openarm"])
 def test_another_arm_is_only_data(engine: Engine, name: str) -> None:
-    if name == "iiwa_table":
-        pytest.importorskip("pybullet_data")
     options = {"clock": "lock_step", "pad": "none", "overrides": ["cameras={}"]}
     with hal.open(name, sim=True, engine=engine.name, **options) as rig:
         for arm in rig.robots.values():

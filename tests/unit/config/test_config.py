@@ -47,9 +47,8 @@ def with_real_drivers(config: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", list_data("config"))
 def test_every_built_in_rig_is_valid(name: str) -> None:
-    package = {"iiwa_table": "pybullet_data", "baxter_table": "example_robot_data"}.get(name)
-    if package is not None and package_folder(package) is None:
-        pytest.skip(f"needs the package {package}")
+    if name == "baxter_table" and package_folder("example_robot_data") is None:
+        pytest.skip("needs the package example_robot_data")
     rig = plan(name)
     assert rig.robots
     assert rig.world is not None
@@ -287,7 +286,6 @@ def test_limits_may_be_tightened_by_the_rig() -> None:
 
 
 def test_position_and_speed_limits_may_come_from_the_urdf() -> None:
-    pytest.importorskip("pybullet_data")
     limits = plan("iiwa_table").robots[0].limits
     assert limits.lower[0] == pytest.approx(-math.radians(170))
     assert limits.upper[6] == pytest.approx(math.radians(175))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -169,12 +168,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         (robot(limits={"velocity": -1.0}), "robots.arm.limits.velocity", "out_of_range"),
         (robot(gripper={"speed": 0.9}), "robots.arm.gripper.speed", "looser_limit"),
         (robot(gripper={"force": 100}), "robots.arm.gripper.force", "looser_limit"),
-        pytest.param(
-            {"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}},
-            "robots.a.gripper",
-            "no_gripper",
-            marks=pytest.mark.skipif(find_spec("pybullet_data") is None, reason="needs pybullet_data"),
-        ),
+        ({"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}}, "robots.a.gripper", "no_gripper"),
         (robot(workspace={"upper": [1, 1, 0.1], "table_height": 0.2}), "robots.arm.workspace", "empty_range"),
         # Objects.
         (thing(half_extents=None), "objects.0", "missing_key"),
@@ -374,7 +368,6 @@ def test_arguments() -> None:
 
 
 def test_a_real_arm_without_a_driver_for_it() -> None:
-    pytest.importorskip("pybullet_data")
     problem = only({"robots": {"arm": {"model": "iiwa"}}}, sim=False)
     assert (problem.key, problem.code) == ("robots.arm", "no_driver")
     assert "robots.arm.drivers.real" in problem.message

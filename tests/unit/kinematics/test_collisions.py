@@ -107,8 +107,6 @@ def slides(folder: Path) -> str:
 
 @pytest.mark.parametrize("models", [("panda",), ("iiwa", "panda"), ("slides",)], ids="+".join)
 def test_bounds_never_exceed_distances(models: Sequence[str], tmp_path: Path) -> None:
-    if "iiwa" in models:
-        pytest.importorskip("pybullet_data", reason="needs pybullet_data (pip install pybullet)")
     robots = arms(*(slides(tmp_path) if model == "slides" else model for model in models), apart=0.7)
     model = CollisionModel(robots, CollisionSpec(boxes=(TABLE,)))
     lower = np.concatenate([r.limits.lower for r in robots])

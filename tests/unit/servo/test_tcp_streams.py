@@ -28,8 +28,6 @@ BOX = WorkspaceSpec((0.1, -0.5, 0.1), (0.75, 0.5, 0.9))
 
 def arm(model: str) -> RobotSpec:
     """The arm as a rig that names only its model has it."""
-    if model == "iiwa":
-        pytest.importorskip("pybullet_data")
     return load({"robots": {"arm": {"model": model}}}).resolve().robots[0]
 
 

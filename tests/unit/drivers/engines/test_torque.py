@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engines_kit import Engine
-from specs import PANDA_HOME, box, data, iiwa, panda
+from specs import PANDA_HOME, box, iiwa, panda
 from torque_kit import NOTHING, N, one, simulated
 
 from hal.config import load
@@ -161,8 +161,6 @@ class TestDriver:
     @pytest.mark.parametrize("model", ["fr3", "iiwa", "yam"])
     def test_it_is_the_arm_that_dynamics_describe(self, engine: Engine, model: str) -> None:
         """Its inertia with open fingers at rest, and its weight: without more torque it stays where it is."""
-        if model == "iiwa":
-            data("")
         plan = load({"robots": {"arm": {"model": model}}}, sim=True, engine=engine.name).resolve()
         assert plan.world is not None
         spec, world = plan.robots[0], engine.world_of(plan.world)

@@ -109,6 +109,21 @@ def test_without_the_package_of_its_meshes_a_link_is_drawn_by_its_collision_shap
         assert world.aabb("thing")["upper"][2] == pytest.approx(0.65, abs=2e-3)
 
 
+def test_the_first_of_several_shapes_whose_file_exists_is_drawn_and_touched(tmp_path: Path) -> None:
+    (tmp_path / "there.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    there = '<mesh filename="there.obj"/>'
+    visual = f'{ABSENT}<mesh filename="gone.obj"/>{there}<box size="1 1 1"/>'
+    spec = urdf_of(tmp_path, visual, f'{ABSENT}<box size="2 2 2"/>')
+    shown = drawn(spec)
+    (visual,) = shown.visuals(shown.bodies["thing"].id)
+    assert (visual.kind, Path(visual.file).name, shown.notes) == ("mesh", "there.obj", [])
+    with stepped(spec) as world:
+        assert world.aabb("thing")["upper"][2] == pytest.approx(1.5, abs=2e-3)
+    plain = drawn(urdf_of(tmp_path, f'{ABSENT}<box size="1 1 1"/>', there))
+    assert plain.visuals(plain.bodies["thing"].id)[0].kind == "box"
+    assert "no_such_meshes" in plain.notes[0]
+
+
 @pytest.mark.parametrize(
     ("visual", "collision", "code"),
     [
