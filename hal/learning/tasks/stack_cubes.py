@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...geometry import Pose
-from .task_env import CLOSED, GRASP_HEIGHT, HEIGHT, OPEN, Action, TaskEnv, closeness, cube_entry
+from .task_env import CLOSED, GRASP_HEIGHT, HEIGHT, OPEN, Action, Array, TaskEnv, closeness, cube_entry
 
 __all__ = ["StackCubes"]
 
@@ -41,7 +41,7 @@ class StackCubes(TaskEnv):
             if red.distance(green)[0] >= APART:
                 return {"red": red, "green": green}
 
-    def off(self) -> np.ndarray:
+    def off(self) -> Array:
         """Return how far the red cube is from its place (3,), m."""
         return self.poses["red"].position - self.poses["green"].position - (0.0, 0.0, SIDE)
 

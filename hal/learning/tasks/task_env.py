@@ -11,11 +11,12 @@ from typing import Any, ClassVar, Literal, get_args
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import CommandError, NotSupported, Unreachable
 from ...geometry import Pose
+from ...observation import Observation
 from ..gym import ObservationDict, RigEnv, entry_key, pose_array
 
 __all__ = ["CLOSED", "GRASP_HEIGHT", "OPEN", "RewardType", "TaskEnv", "closeness", "cube_entry", "goal_entry"]
@@ -57,7 +58,7 @@ def cube_entry(name: str, side: float, rgba: tuple[float, float, float, float]) 
 
 
 def goal_entry(name: str, radius: float) -> dict[str, Any]:
-    """Return the entry of a rig file for a transparent ball of ``radius``, m, which shows a goal and touches nothing."""
+    """Return the entry of a rig file for a transparent ball of ``radius``, m, that shows a goal and touches nothing."""
     entry = {"name": name, "shape": "sphere", "radius": radius, "rgba": [0.2, 0.8, 0.3, 0.4]}
     return entry | {"collision": False, "fixed": True}
 
@@ -138,7 +139,11 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
             raise
         self._most = self.rig_env.action_space.high[[0, 1, 2, 5]].astype(float)
         self.action_space: Box = Box(-1.0, 1.0, (5,), np.float32)  # type: ignore[assignment]
-        self.observation_space: Dict = self._make_space()  # type: ignore[assignment]  # invariant in their types
+        self._bounds = self._find_bounds()
+        boxes: dict[str, Space[Any]] = {
+            name: Box(low, high, dtype=np.float32) for name, (low, high) in self._bounds.items()
+        }
+        self.observation_space: Dict = Dict(boxes)  # type: ignore[assignment]  # gymnasium's is invariant
 
     # What a task overrides.
 
@@ -185,7 +190,7 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
         return float(np.linalg.norm(self.rig_env.rig.world.velocity(name)[0]))
 
     def draw(self, height: float) -> Pose:
-        """Return a random pose in the work area at a height over the table, m, turned by up to 45 degrees either way."""
+        """Return a random pose in the work area at a height over the table, m, turned by up to 45 degrees."""
         x, y = self.centre + self.np_random.uniform(-AREA, AREA, 2)
         return Pose.from_rpy((x, y, height), (0.0, 0.0, self.np_random.uniform(-_TURN, _TURN)))
 
@@ -249,8 +254,6 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
         numbers = np.asarray(action, float)
         if numbers.shape != (5,):
             raise CommandError(f"an action has shape (5,), not {numbers.shape}", code="bad_action")
-        if self.rig_env.observation is None:
-            raise CommandError("call reset before step", code="not_reset")
         numbers = np.clip(numbers, -1.0, 1.0)
         upright = np.cross(self.tcp.matrix()[:3, 2], (0.0, 0.0, -1.0))[:2]  # what turns the tcp's z axis down again
         velocity = numbers[:4] * self._most
@@ -272,7 +275,9 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
     # Details.
 
     @property
-    def _seen(self) -> Any:
+    def _seen(self) -> Observation:
+        if self.rig_env.observation is None:
+            raise CommandError("call reset before step", code="not_reset")
         return self.rig_env.observation
 
     def _observe(self, seen: ObservationDict) -> ObservationDict:
@@ -283,22 +288,21 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
             key = entry_key("object", entry["name"])
             pose = to_base @ Pose(seen[key][:3], seen[key][3:])
             self.poses[entry["name"]], shown[key] = pose, pose_array(pose)
-        boxes = self.observation_space.spaces
-        return {key: np.clip(value.astype(np.float32), boxes[key].low, boxes[key].high) for key, value in shown.items()}
+        return {name: np.clip(value, *self._bounds[name]).astype(np.float32) for name, value in shown.items()}
 
-    def _make_space(self) -> Dict:
-        """Return the bounds of observations."""
+    def _find_bounds(self) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Return the lower and upper bounds of each entry of an observation."""
         limits, gripper = self.arm.limits, self.arm.gripper
         assert gripper is not None
-        pose = np.array([_BOUND] * 3 + [1.0] * 4)
-        ends = {
-            "q": (limits.lower, limits.upper),
-            "dq": (np.negative(limits.velocity), limits.velocity),
+        pose = np.array([_BOUND] * 3 + [1.0] * 4, np.float32)
+        speed, width = np.array(limits.velocity, np.float32), np.array([gripper.width_max], np.float32)
+        bounds = {
+            "q": (np.array(limits.lower, np.float32), np.array(limits.upper, np.float32)),
+            "dq": (-speed, speed),
             "tcp": (-pose, pose),
-            "gripper": ([0.0], [gripper.width_max]),
+            "gripper": (0.0 * width, width),
         }
-        ends |= {entry_key("object", entry["name"]): (-pose, pose) for entry in self.objects}
-        return Dict({key: Box(np.float32(low), np.float32(high), dtype=np.float32) for key, (low, high) in ends.items()})
+        return bounds | {entry_key("object", entry["name"]): (-pose, pose) for entry in self.objects}
 
     def _check_gripper(self) -> None:
         """Check that the arm has a gripper that opens far enough. Raises NotSupported."""
@@ -336,7 +340,9 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
             if not touched:
                 return q
             why = str(touched[0])
-        text = f"{what} is out of reach: with the hand pointing down at {x:.2f}, {y:.2f}, {z:.2f} m from the base, {why}"
+        text = (
+            f"{what} is out of reach: with the hand pointing down at {x:.2f}, {y:.2f}, {z:.2f} m from the base, {why}"
+        )
         raise CommandError(f"{text}; choose another robot, place or distance=", code="out_of_reach")
 
 
