@@ -132,7 +132,7 @@ def run_episode(env: gymnasium.Env, seed: int, scripted: bool) -> tuple[float, b
     task = env.unwrapped
     assert isinstance(task, TaskEnv)
     total = 0.0
-    for action in task.solve() if scripted else iter(env.action_space.sample, None):
+    for action in task.solve() if scripted else (env.action_space.sample() for _ in itertools.count()):
         _, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
         if terminated or truncated:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -29,10 +30,14 @@ def env(request: pytest.FixtureRequest) -> Iterator[Any]:
     env.close()
 
 
-def test_gymnasium_has_nothing_to_warn_of(env: Any) -> None:
+def test_the_checkers_have_nothing_to_warn_of(env: Any) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped, skip_close_check=True)
+        if os.environ.get("HAL_SB3") == "1":  # not by default: PyTorch may bring gigabytes of CUDA
+            from stable_baselines3.common import env_checker
+
+            env_checker.check_env(env)
     boxes = [*env.observation_space.values(), env.action_space]
     assert all(box.dtype == np.float32 and box.is_bounded() for box in boxes)
 
