@@ -37,7 +37,7 @@ class PushCube(TaskEnv):
     """Push a cube over the table to a goal that is 6 to 18 cm farther ahead.
 
     The cube stands near the middle of the work area, turned by up to 45 degrees either way. Success: the cube's middle
-    is within 2.5 cm of the goal, on the table and at rest.
+    is within 2.5 cm of the goal, and at rest.
 
     Dense reward: -1, and a half each for the hand near the cube and for the cube near the goal.
     """
