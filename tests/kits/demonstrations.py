@@ -16,6 +16,8 @@ from hal.skills import gentle_grasp, grasp, grasp_pose, locate_by_truth, push_to
 
 AHEAD = 5
 """Rows from what is seen to what is learned."""
+BACK = 0.3
+"""Share of the way back to where the demonstrations were; without it a policy beside them stays beside them."""
 SCALE = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.006])
 """Distance of two states that count as different: tcp (m), its yaw (cosine, sine), width (m)."""
 
@@ -109,7 +111,9 @@ class Kernel:
         """Return the state (6,) some rows after the state ``near`` (6,)."""
         distance = np.square((self.states - near) / SCALE).sum(axis=1)
         weights = np.exp(-0.5 * (distance - distance.min()))
-        after: np.ndarray = weights @ self.actions / weights.sum() + [*near[:5], 0.0]
+        weights /= weights.sum()
+        after: np.ndarray = weights @ self.actions
+        after[:5] += near[:5] + BACK * (weights @ self.states - near)[:5]
         return after
 
 
