@@ -58,8 +58,8 @@ def cube_entry(name: str, side: float, rgba: tuple[float, float, float, float]) 
 
 
 def goal_entry(name: str, radius: float) -> dict[str, Any]:
-    """Return the entry of a rig file for a transparent ball of ``radius``, m, that shows a goal and touches nothing."""
-    entry = {"name": name, "shape": "sphere", "radius": radius, "rgba": [0.2, 0.8, 0.3, 0.4]}
+    """Return the entry of a rig file for a green ball of ``radius``, m, that shows a goal and touches nothing."""
+    entry = {"name": name, "shape": "sphere", "radius": radius, "rgba": [0.2, 0.8, 0.3, 1.0]}
     return entry | {"collision": False, "fixed": True}
 
 
@@ -349,9 +349,9 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
 def _make_rig(
     robot: str | Mapping[str, Any], objects: tuple[Mapping[str, Any], ...], *, camera: bool
 ) -> dict[str, Any]:
-    """Return the rig file of a task: the table and, if wanted, the camera of ``panda_table``."""
+    """Return the rig file of a task: the arm at a table with the objects and, if wanted, a camera."""
     arm = {"model": robot} if isinstance(robot, str) else dict(robot)
-    view = {"target": [-0.1, 0, 0.68], "distance": 1.1, "yaw_deg": 60, "pitch_deg": -30}
+    view = {"target": [-0.1, 0, 0.7], "distance": 0.85, "yaw_deg": 60, "pitch_deg": -30}
     picture = {"model": "pinhole", "look_at": view, "streams": ["color"], "output": {"width": 256, "height": 256}}
     base, table = {"position": _BASE.position.tolist()}, {"name": "table", "size": [1.5, 1, 0.05]}
     return {
