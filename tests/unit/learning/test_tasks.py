@@ -1,0 +1,146 @@
+"""Tasks with a name: Gymnasium's checks, seeds, scripted solutions, tasks of a user, and errors."""
+
+from __future__ import annotations
+
+import functools
+import os
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from errors_kit import raises_code
+
+import hal
+
+gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]'")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from hal.gym import TaskEnv  # noqa: E402
+from hal.learning.tasks import TASKS  # noqa: E402
+from hal.learning.tasks.pick_cube import PickCube  # noqa: E402
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def env(request: pytest.FixtureRequest) -> Iterator[Any]:
+    env = gymnasium.make(f"hal/{request.param}-v0")
+    yield env
+    env.close()
+
+
+def test_the_checkers_have_nothing_to_warn_of(env: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_close_check=True)
+        if os.environ.get("HAL_SB3") == "1":  # not by default: PyTorch may bring gigabytes of CUDA
+            from stable_baselines3.common import env_checker
+
+            env_checker.check_env(env)
+    boxes = [*env.observation_space.values(), env.action_space]
+    assert all(box.dtype == np.float32 and box.is_bounded() for box in boxes)
+
+
+def test_the_same_seed_gives_the_same_episode_to_the_bit(env: Any) -> None:
+    def run(seed: int) -> bytes:
+        seen, _ = env.reset(seed=seed)
+        env.action_space.seed(1)
+        trace = [seen]
+        for _ in range(5):
+            seen, reward, *_ = env.step(env.action_space.sample())
+            trace += [seen, {"reward": np.array(reward)}]
+        return b"".join(value.tobytes() for part in trace for value in part.values())
+
+    assert run(3) == run(3)
+    assert run(3) != run(4)
+
+
+def test_its_scripted_solution_succeeds_and_ends_the_episode(env: Any) -> None:
+    env.reset(seed=0)
+    rewards = []
+    for action in env.unwrapped.solve():
+        assert env.action_space.contains(action)
+        _, reward, terminated, truncated, info = env.step(action)
+        rewards.append(reward)
+        assert info["success"] is terminated
+        if terminated or truncated:
+            break
+    assert terminated
+    assert rewards[-1] == 0.0
+    assert -1.0 <= min(rewards) < max(rewards[:-1]) < 0.0
+    assert np.mean(rewards[-10:]) > np.mean(rewards[:10]) + 0.2, "the reward shows the way"
+
+
+def test_an_episode_without_success_is_truncated() -> None:
+    env = gymnasium.make("hal/PushCube-v0", reward_type="sparse", max_episode_steps=3)
+    try:
+        env.reset(seed=0)
+        still = np.array([0.0, 0.0, 0.0, 0.0, -1.0], np.float32)
+        ends = [env.step(still)[1:] for _ in range(3)]
+        assert [(reward, *end) for reward, *end, _ in ends] == [(-1.0, False, False)] * 2 + [(-1.0, False, True)]
+        assert ends[-1][-1]["success"] is False
+    finally:
+        env.close()
+
+
+class Reach(PickCube):
+    """Bring the hand to the goal."""
+
+    def success(self) -> bool:
+        return self._off() < 0.02
+
+    def reward(self) -> float:
+        return -min(1.0, self._off())
+
+    def _off(self) -> float:
+        return self.tcp.distance(self.poses["goal"])[0]
+
+
+def test_a_user_registers_an_own_task() -> None:
+    gymnasium.register("test/Reach-v0", Reach, max_episode_steps=100)
+    env = gymnasium.make("test/Reach-v0")
+    try:
+        goal, cube = hal.Pose([0.5, 0.05, 0.1]), hal.Pose([0.45, -0.05, 0.025])
+        seen, _ = env.reset(options={"poses": {"goal": goal, "cube": cube}})
+        assert seen["object_goal"][:3] == pytest.approx(goal.position)
+        assert seen["object_cube"][:3] == pytest.approx(cube.position, abs=1e-3)
+        for action in env.unwrapped.go(goal.position, 0.0, -1.0):
+            seen, reward, terminated, _, _ = env.step(action)
+            if terminated:
+                break
+        assert terminated
+        off = np.linalg.norm(seen["tcp"][:3] - goal.position)
+        assert (reward, off) == (pytest.approx(-off, abs=1e-6), pytest.approx(0.02, abs=0.015))
+    finally:
+        gymnasium.registry.pop("test/Reach-v0")
+        env.close()
+
+
+def test_what_cannot_be_is_named() -> None:
+    make = functools.partial(gymnasium.make, "hal/PickCube-v0")
+    with pytest.raises(gymnasium.error.NameNotFound, match="PickCube"):
+        gymnasium.make("hal/PickCup-v0")
+    with raises_code(hal.ConfigError, "config"):
+        make(robot="pandda")
+    with raises_code(hal.NotSupported, "no_gripper"):
+        make(robot={"model": "panda", "gripper": {"enabled": False}})
+    with raises_code(hal.CommandError, "out_of_reach"):
+        make(distance=0.9)
+    with raises_code(hal.CommandError, "bad_reward_type"):
+        make(reward_type="shaped")
+
+
+def test_an_object_out_of_reach_and_a_step_before_the_reset_are_refused() -> None:
+    env = gymnasium.make("hal/PickCube-v0").unwrapped
+    assert isinstance(env, TaskEnv)
+    try:
+        with raises_code(hal.CommandError, "not_reset"):
+            env.step(np.zeros(5, np.float32))
+        with pytest.raises(hal.CommandError, match="cube is out of reach"):
+            env.reset(options={"poses": {"cube": hal.Pose([1.2, 0.0, 0.025])}})
+        env.reset()
+        with raises_code(hal.CommandError, "bad_action"):
+            env.step(np.zeros(7, np.float32))
+    finally:
+        env.close()
