@@ -421,7 +421,7 @@ class Robot:
             return self._make_motion(self._planner().plan_joints(self._start_position(), goals), terms)
         assert target is not None
         goal = self._goal(target)
-        self._check_collisions(np.array([self.state().q, goal]))
+        self._check_collisions(np.array([self._start_position(), goal]))
         return ArmMotion(self, Control(self, goal=goal, **terms))
 
     def _prepare_along(self, poses: Sequence[Pose], blend: float, terms: dict[str, Any]) -> ArmMotion:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from math import copysign, isfinite
+from math import isfinite
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -75,8 +75,11 @@ class ArmElsewhere:
             q = self._stop[0] if state is None else state.q.tolist()
         if stops:
             jerk = self._jerk if record.controller is ControlMode.POSITION else self._compliant_jerk
-            limits = zip(record.q_set, record.dq_set, self._acceleration, jerk, strict=True)
-            self._stop = q, [x + _OLD * v + copysign(stop_distance(abs(v), A, J), v) for x, v, A, J in limits]
+            # On a straight path all joints stop together, and so none of them sooner than by itself.
+            limits = zip(record.dq_set, self._acceleration, jerk, strict=True)
+            moving = [(A / abs(v), J / abs(v)) for v, A, J in limits if v]
+            seconds = _OLD + (stop_distance(1.0, *map(min, zip(*moving, strict=True))) if moving else 0.0)
+            self._stop = q, [x + seconds * v for x, v in zip(record.q_set, record.dq_set, strict=True)]
         else:
             self._stop = q, q
         return self._stop
@@ -108,13 +111,13 @@ class _ArmHere:
         unit, servo = self._unit, self._unit.servo
         report, smoother = servo.report, servo.smoother
         if servo.active and report.controller is ControlMode.POSITION:
-            return report.q_set, smoother.stop_end() if report.q_set is smoother.q else report.q_set
+            return report.q_set, servo.stop_end() if report.q_set is smoother.q else report.q_set
         if servo.active and report.controller is ControlMode.TORQUE:  # its set-point is where it was measured
             return report.q_set, [q + _TORQUE_STOP * v for q, v in zip(report.q_set, report.dq_set, strict=True)]
         q = self._measured if unit.reading is None else unit.reading.q
         if len(q) == smoother.n and isfinite(sum(q)):  # else where it was measured last
             self._measured = q
-        return self._measured, smoother.stop_end() if servo.active else self._measured
+        return self._measured, servo.stop_end() if servo.active else self._measured
 
 
 def guard_arms(group: GroupSpec, units: Mapping[str, GuardedArm], others: Iterable[GroupMemory]) -> list[str]:

@@ -363,7 +363,7 @@ def _reach(model: Any, geometry: Any, columns: Sequence[int], pin: Any) -> Array
 def _axes(model: Any, pin: Any) -> Array:
     """Return the axis (3,) of each joint in its own frame; zeros for the first, which is the world."""
     data = model.createData()
-    jacobian = pin.computeJointJacobians(model, data, pin.neutral(model))
+    jacobian = pin.computeJointJacobians(model, data, pin.neutral(model)).reshape(6, -1)  # (6,) for one joint
     axes = np.zeros((model.njoints, 3))
     for k in range(1, model.njoints):
         column = jacobian[:, int(model.joints[k].idx_v)]

@@ -25,7 +25,9 @@ _STEP = 1e-3
 _SAME_PLACE = 1e-3
 """Bases of two arms that are this near are in one place, m."""
 _TOLERANCE = 5e-6
-"""Shapes that are nearer than the margin where a motion begins may come so much nearer still, m."""
+_BACK = 4e-5
+"""Shapes that are nearer than the margin where a motion begins may come so much nearer still, m, and so much back while
+they part; the servo allows twice and 5e-5 m."""
 
 
 class Collisions:
@@ -95,7 +97,7 @@ class Collisions:
 
         Args:
             q_samples: Joint positions (k, n), rad, in the order of the motion. Pairs that are nearer than the margin at
-                the first one may stay so, but not come nearer.
+                the first one may stay so or part, but not come nearer again.
         """
         found = self._first(self._samples(q_samples))
         return None if found is None else (found[0], found[2])
@@ -130,12 +132,13 @@ class Collisions:
         """Return the index of the end of the segment with the first collision, its share of it, and the pair.
 
         Each step along a segment is as long as no pair can get under its margin, but comes :data:`_STEP` nearer at
-        least.
+        least. What is in its margin at first may not come nearer, nor come back.
         """
         model, bounds = self.model, self._bounds
+        margins = model.margins
         others = self._all(samples[0])
         model.place(others)
-        least = np.minimum(model.margins, model.distances() - _TOLERANCE)
+        least = np.minimum(margins, model.distances() - _TOLERANCE)
         start = samples[0]
         for index in range(max(1, len(samples) - 1)):
             end = samples[min(index + 1, len(samples) - 1)]
@@ -145,17 +148,19 @@ class Collisions:
             share = 0.0
             while True:
                 others[self._own] = start + share * (end - start)
-                near = bounds.near(others, (1.0 - share) * way, least)
+                near = bounds.near(others, (1.0 - share) * way, margins)
+                distances, before = bounds.distances[near], least[near]
+                least = margins.copy()
                 if not near:
                     break
-                left = bounds.distances[near] - least[near]
-                worst = int(np.argmin(left))
-                if left[worst] < 0.0:
-                    pair = model.pair(near[worst], float(bounds.distances[near[worst]]))
-                    return min(index + 1, len(samples) - 1), share, pair
+                worst = int(np.argmin(distances - before))
+                if distances[worst] < before[worst]:
+                    return min(index + 1, len(samples) - 1), share, model.pair(near[worst], float(distances[worst]))
+                least[near] = np.maximum(before, np.minimum(margins[near], distances - _BACK))
                 if share >= 1.0:
                     break
-                share = min(1.0, share + float((np.maximum(left, _STEP) / speed[near]).min()))
+                steps = float((speed[near] / np.maximum(distances - margins[near], _STEP)).max())
+                share = min(1.0, share + 1.0 / max(1.0, steps))
             start = end
         return None
 

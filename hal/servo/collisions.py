@@ -1,9 +1,10 @@
 """Keep an arm off itself, off boxes and off other arms, by the servo's own rule: its stop from here keeps the margin.
 
-A step is allowed if no pair of shapes gets nearer than its margin in it and in the time-optimal stop after it, wherever
-the other arms are on their own stops. Every step that replaces one that is not allowed is part of a stop that was, so
-the margin is kept whatever is commanded. A pair that is inside its margin (an arm that starts there, or one that
-another arm has approached) may not come nearer: moving apart is always possible.
+A step is allowed if no pair of shapes gets nearer than its margin in it and in the stop after it (the time-optimal one
+of each joint, or one on the path of a motion), wherever the other arms are on their own stops. Every step that replaces
+one that is not allowed is part of a stop that was, so the margin is kept whatever is commanded. A pair that is inside
+its margin (an arm that starts there, or one that another arm has approached) may not come nearer: moving apart is
+always possible.
 
 An arm that follows torques may be elsewhere than its set-point. It is checked where it is measured
 (:class:`MeasuredGuard`).
@@ -14,7 +15,10 @@ stop can go, before any pair can be too near.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from itertools import compress
 from math import ceil, dist, hypot, inf, sqrt
 from operator import mul, sub
 
@@ -22,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kinematics.collision_model import CollisionModel, PairBounds
-from .smoothing import JointSmoother, speed_for, stop_displacement, stop_distance, stop_peak, stop_phases, stop_step
+from .smoothing import JointSmoother, speed_for, stop_at, stop_displacement, stop_distance, stop_peak, stop_pieces
 
-__all__ = ["CollisionGuard", "MeasuredGuard", "Neighbour"]
+__all__ = ["CollisionGuard", "MeasuredGuard", "Neighbour", "Stop"]
 
 Array = NDArray[np.float64]
 Floats = Sequence[float]
@@ -53,6 +57,54 @@ _NOISE = 1e-3
 """A measured arm that begins inside a margin, or at it, may come so much nearer, m: its position is not exact."""
 
 
+class Stop(ABC):
+    """A stop after a step. Its places have numbers, from 0 where it begins to 1 where it ends."""
+
+    ways: Floats
+    """How far each joint goes at most (n,), rad."""
+
+    @abstractmethod
+    def at(self, u: float) -> Floats:
+        """Return the joint positions (n,), rad, at place ``u``."""
+
+    @abstractmethod
+    def ways_between(self, u: float, v: float) -> Floats:
+        """Return how far each joint goes at most (n,), rad, between two places."""
+
+
+class _JointStop(Stop):
+    """The time-optimal stop of each joint by itself."""
+
+    def __init__(self, q: Floats, dq: Floats, ddq: Floats, smoother: JointSmoother) -> None:
+        self._state = list(zip(q, dq, ddq, smoother.acceleration, smoother.jerk, strict=True))
+        self.ways = [max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) for _, v, a, A, J in self._state]
+        self._places: dict[float, Floats] = {0.0: q}
+
+    @cached_property
+    def _pieces(self) -> list[list[tuple[float, ...]]]:
+        return [stop_pieces(*joint) for joint in self._state]
+
+    @cached_property
+    def _duration(self) -> float:
+        return max([pieces[-1][1] for pieces in self._pieces])
+
+    @cached_property
+    def _turned(self) -> Floats:
+        """How much farther each joint goes than two positions differ (n,), rad: there and back, where it turns back."""
+        state = zip(self._state, self.ways, strict=True)
+        return [2.0 * way if v * (v + 0.5 * a * abs(a) / J) < 0.0 else 0.0 for (_, v, a, _, J), way in state]
+
+    def at(self, u: float) -> Floats:
+        place = self._places.get(u)
+        if place is None:
+            t = self._duration * (1.0 - sqrt(1.0 - u))  # equal ways, where the braking is constant
+            place = self._places[u] = [stop_at(pieces, t)[0] for pieces in self._pieces]
+        return place
+
+    def ways_between(self, u: float, v: float) -> Floats:
+        return [abs(x - y) + more for x, y, more in zip(self.at(u), self.at(v), self._turned, strict=True)]
+
+
 class CollisionGuard:
     """Checks the steps of one arm, and slows down its goals.
 
@@ -68,6 +120,8 @@ class CollisionGuard:
         self._smoother = smoother
         self._floors: dict[int, float] = {}
         """Smallest distance allowed for each pair that is inside its margin, m."""
+        self._presents: tuple[Floats, dict[int, float]] = (), {}
+        """Set-point (n,), rad, and what :meth:`_present` returned there."""
         self._fastest = [0.0] * smoother.n
         self._slowest = 0.0
         self._per_speed = self._per_acceleration = 0.0
@@ -139,41 +193,44 @@ class CollisionGuard:
             return dq
         return [share * v for v in dq]
 
-    def allows(self) -> bool:
-        """Return whether the proposed step, and the stop after it, keep every margin, or come no nearer than now."""
+    def allows(self, stop: Stop | None = None) -> bool:
+        """Return whether the proposed step, and the stop after it, keep every margin, or come no nearer than now.
+
+        Args:
+            stop: The stop, if it is made along a path; None if each joint stops by itself.
+        """
+        if stop is None and self._is_far_next():
+            return True
         smoother, around = self._smoother, self._around
-        q, dq, ddq = smoother.q_next, smoother.dq_next, smoother.ddq_next
-        speed, acceleration = hypot(*dq), hypot(*ddq)
+        q = smoother.q_next
+        on_path = stop is not None
+        stop = stop or _JointStop(q, smoother.dq_next, smoother.ddq_next, smoother)
+        near = [] if around.stays_clear(q, stop.ways) else around.near(q, stop.ways)
+        tight, present = [], []
+        for k in self._unproven(near, stop):
+            now = self._present(k, on_path)
+            # What is at its margin counts as in it: from there hardly a way out could be proven.
+            if k not in self._floors and now > self._margins[k] + _TOLERANCE:
+                return False
+            tight.append(k)
+            present.append(now)
+        self._floors = {k: floor for k, floor in self._floors.items() if k in tight}
+        if not tight:
+            return True
+        ahead = self._lowest(tight, stop)
+        nearest = [min(self._floor(k, now) - _TOLERANCE, now) for k, now in zip(tight, present, strict=True)]
+        return all(d >= least for d, least in zip(ahead, nearest, strict=True))
+
+    def _is_far_next(self) -> bool:
+        """Return whether no stop of the joints after the proposed step comes near anything, or nothing moves."""
+        smoother, around = self._smoother, self._around
+        q, dq = smoother.q_next, smoother.dq_next
+        speed, acceleration = hypot(*dq), hypot(*smoother.ddq_next)
         if speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True)):
             _, per_speed, per_acceleration = around.shares
             if around.is_clear(q, per_speed * speed + per_acceleration * acceleration):
                 return True
-        if speed == acceleration == 0.0 and dist(q, smoother.q) < _NOWHERE:
-            return True
-        limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
-        ways = [
-            max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) for v, a, (A, J) in zip(dq, ddq, limits, strict=True)
-        ]
-        near = [] if around.stays_clear(q, ways) else around.near(q, ways)
-        if not near:
-            self._floors.clear()
-            return True
-        tight = self._unproven(near, q, dq, ddq)
-        self._floors = {k: floor for k, floor in self._floors.items() if k in tight}
-        if not tight:
-            return True
-        v0, a0 = smoother.dq, smoother.ddq
-        present_ways = [
-            max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) for v, a, (A, J) in zip(v0, a0, limits, strict=True)
-        ]
-        around.near(smoother.q, present_ways)
-        present = self._lowest(tight, smoother.q, v0, a0, present_ways)
-        margins = [self._margins[k] - _TOLERANCE for k in tight]
-        if any(now >= margin and k not in self._floors for k, now, margin in zip(tight, present, margins, strict=True)):
-            return False
-        ahead = self._lowest(tight, q, dq, ddq, ways)
-        nearest = [min(self._floor(k, now) - _TOLERANCE, now) for k, now in zip(tight, present, strict=True)]
-        return all(d >= least for d, least in zip(ahead, nearest, strict=True))
+        return speed == acceleration == 0.0 and dist(q, smoother.q) < _NOWHERE
 
     def allows_arm(self, q: Floats, dq: Floats, seconds: float) -> bool:
         """Return whether an arm that follows the set-point by a controller's torques keeps apart.
@@ -195,6 +252,17 @@ class CollisionGuard:
         followed = zip(q, dq, smoother.stop_end(), smoother.q, smoother.dq, strict=True)
         return measured.allows(q, [[x + end - goal + seconds * (v - w) for x, v, end, goal, w in followed]])
 
+    def _present(self, k: int, on_path: bool) -> float:
+        """Return the smallest distance (m) of a pair now, and, unless the arm is on a path, in a stop of its joints."""
+        smoother, (q, found) = self._smoother, self._presents
+        if q is not smoother.q:
+            found = {}
+            self._presents = smoother.q, found
+        if k not in found:
+            now = _JointStop(smoother.q, smoother.dq, smoother.ddq, smoother)
+            found[k] = self._around.lowest([k], [smoother.q])[0] if on_path else self._lowest([k], now)[0]
+        return found[k]
+
     def _floor(self, k: int, now: float) -> float:
         """Return the smallest distance allowed for a pair that keeps ``now`` (m) in a stop from now.
 
@@ -213,58 +281,44 @@ class CollisionGuard:
         """Return the way (rad) in which a joint brakes gently from the speed ``v`` (rad/s), and of two ticks before."""
         return stop_distance(v, _BRAKE * A, _BRAKE_JERK * J) + 2.0 * self._smoother.dt * v
 
-    def _unproven(self, pairs: Sequence[int], q: Floats, dq: Floats, ddq: Floats) -> list[int]:
-        """Return the pairs for which it is not proven that the stop from ``q``, ``dq``, ``ddq`` keeps their margins.
+    def _unproven(self, pairs: Sequence[int], stop: Stop) -> Iterator[int]:
+        """Yield the pairs for which it is not proven that a stop keeps their margins.
 
-        Between two times at which shapes have the distances d and e, while they come at most w nearer, they are nowhere
-        nearer than (d + e - w) / 2. Where that is too little, the distance is computed in between.
+        Between two places at which shapes have the distances d and e, while they come at most w nearer, they are
+        nowhere nearer than (d + e - w) / 2. Where that is too little, the distance is computed in between.
         """
-        smoother, around = self._smoother, self._around
-        state = list(zip(q, dq, ddq, smoother.acceleration, smoother.jerk, strict=True))
-        turned = [  # a joint that turns back goes there and back beyond the difference of two positions
-            2.0 * max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) if v * (v + 0.5 * a * abs(a) / J) < 0.0 else 0.0
-            for _, v, a, A, J in state
-        ]
-        duration = max([stop_phases(v, a, A, J)[3] for _, v, a, A, J in state])
-        levers, taken = around.model.levers[pairs], around.approach_of_others(pairs)
+        if not pairs:
+            return
+        around = self._around
+        taken = around.approach_of_others(pairs)
         least = around.model.margins[pairs] - _TOLERANCE
-        own = levers[:, around.own]
+        own = around.model.levers[pairs, around.own]
 
-        def look(t: float) -> tuple[float, Array, Array]:
-            place = [stop_step(x, v, a, A, J, t)[0] for x, v, a, A, J in state] if t > 0.0 else list(q)
-            return t, np.array(place), np.array(around.lowest(pairs, [place]))
+        def look(u: float) -> tuple[float, Array]:
+            return u, np.array(around.lowest(pairs, [stop.at(u)]))
 
-        ends = look(0.0), look(duration)
-        bad = np.minimum(ends[0][2], ends[1][2]) < least
+        ends = look(0.0), look(1.0)
+        failed = np.minimum(ends[0][1], ends[1][1]) < least
+        good = ~failed
+        yield from compress(pairs, failed)
         parts = [ends]
         cuts = 0
-        while parts and not bad.all():
-            (t0, x0, d), (t1, x1, e) = parts.pop()
-            ways = own @ (np.abs(x1 - x0) + turned) + taken
-            unsure = (0.5 * (d + e - ways) < least) & ~bad
-            if not unsure.any():
-                continue
-            if cuts == _CUTS:
-                bad |= unsure
-                continue
-            cuts += 1
-            middle = look(0.5 * (t0 + t1))
-            bad |= middle[2] < least
-            parts += [(middle, (t1, x1, e)), ((t0, x0, d), middle)]
-        return [k for k, wrong in zip(pairs, bad.tolist(), strict=True) if wrong]
+        while parts and good.any():
+            (u, d), (v, e) = parts.pop()
+            failed = 0.5 * (d + e - own @ np.array(stop.ways_between(u, v)) - taken) < least
+            if (good & failed).any() and cuts < _CUTS:
+                cuts += 1
+                middle = look(0.5 * (u + v))
+                parts += [(middle, (v, e)), ((u, d), middle)]
+                failed = middle[1] < least
+            yield from compress(pairs, good & failed)
+            good &= ~failed
 
-    def _lowest(self, pairs: Sequence[int], q: Floats, dq: Floats, ddq: Floats, ways: Floats) -> list[float]:
-        """Return the smallest distance of each pair in the stop that begins at ``q``, ``dq``, ``ddq``, m."""
-        smoother, around = self._smoother, self._around
-        places = [q]
-        count = around.count(pairs, ways)
-        if count > 0:
-            state = list(zip(q, dq, ddq, smoother.acceleration, smoother.jerk, strict=True))
-            duration = max([stop_phases(v, a, A, J)[3] for _, v, a, A, J in state])
-            for k in range(1, count + 1):  # at equal ways, for braking that is constant
-                t = duration * (1.0 - sqrt(1.0 - k / count))
-                places.append([stop_step(x, v, a, A, J, t)[0] for x, v, a, A, J in state])
-        return around.lowest(pairs, places)
+    def _lowest(self, pairs: Sequence[int], stop: Stop) -> list[float]:
+        """Return the smallest distance of each pair in a stop, m."""
+        around = self._around
+        count = around.count(pairs, stop.ways)
+        return around.lowest(pairs, [stop.at(k / max(1, count)) for k in range(count + 1)])
 
 
 class _Surroundings:

@@ -14,7 +14,7 @@ from ..commands import Session
 from ..kinematics.arm import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from ..types import Limited
-from .collisions import CollisionGuard
+from .collisions import CollisionGuard, Stop
 from .smoothing import Guard, JointSmoother, speed_for, stop_displacement, stop_phases
 
 if TYPE_CHECKING:
@@ -555,9 +555,9 @@ class Envelope:
         """Note that a step was refused because the tcp would be too fast."""
         self._refused = Limited.TCP_SPEED
 
-    def keeps_apart(self) -> bool:
-        """Return whether the arm touches nothing in the proposed step and in the stop after it."""
-        if self.collisions is None or self.collisions.allows():
+    def keeps_apart(self, stop: Stop | None = None) -> bool:
+        """Return whether the arm touches nothing in the proposed step and in its stop (None: that of the joints)."""
+        if self.collisions is None or self.collisions.allows(stop):
             return True
         self._refused = Limited.COLLISION
         return False
@@ -566,10 +566,6 @@ class Envelope:
     def blocked(self) -> bool:
         """Whether the last step that was refused would have touched something."""
         return self._refused is Limited.COLLISION
-
-    def allows_on_path(self, smoother: JointSmoother) -> bool:
-        """Return whether a step along a path that was checked before keeps the tcp's speed, and touches nothing."""
-        return self.keeps_tcp_speed(smoother) and self.keeps_apart()
 
     def allows(self, smoother: JointSmoother) -> bool:
         """Return whether a step passes :meth:`keeps_tcp_speed`, :meth:`stays_inside` and :meth:`keeps_apart`."""

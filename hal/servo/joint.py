@@ -1,4 +1,4 @@
-"""Motions in joint space: targets, velocities, chunks of targets, and the straight path of ``move_to``.
+"""Motions in joint space that follow streams: targets, velocities and chunks of targets.
 
 A motion accepts its newest command (``accept``) and moves the smoother once per tick (``step``). It keeps no set-point
 of its own: after a stop or a re-anchoring it is reset (``start``) and continues from where the arm is.
@@ -10,12 +10,9 @@ from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
-from math import ceil, isfinite
-
-from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError
+from math import isfinite
 
 from ..commands import FIRST_STEP_ANGLE, CommandRecord
-from ..errors import CommandError
 from ..types import Limited
 from .envelope import Envelope
 from .smoothing import JointSmoother, speed_for
@@ -24,7 +21,6 @@ __all__ = [
     "ChunkMotion",
     "JointTargetMotion",
     "JointVelocityMotion",
-    "PathMotion",
     "ServoMotion",
     "slope",
 ]
@@ -347,183 +343,3 @@ def slope(d0: float, d1: float, h0: float, h1: float) -> float:
         return 0.0
     share = (h0 + 2.0 * h1) / (3.0 * (h0 + h1))
     return d0 * d1 / (share * d1 + (1.0 - share) * d0)
-
-
-_SAMPLE = 0.05
-_SAMPLES = 64
-"""The path is checked every so many rad, at most this many times: planning must fit into a tick."""
-
-_SLOWER = 0.8
-"""After a step that the guard refused, the rest of the path is planned at this share of the speed before."""
-
-SLOWEST = 0.1
-RETRY = 0.1
-"""Behind something in its way an arm waits so long, s, and continues at this share of the speed at least."""
-
-_HERE = 1e-9
-"""A goal this near needs no motion, rad."""
-
-
-class PathMotion(ServoMotion):
-    """From where the arm rests along ``q0 + (s / length) (goal - q0)``, s running from 0 to length in rad.
-
-    Each joint's limits, seen along the path, bound s; so do the session's speed and the tcp's. Ruckig's time-optimal s
-    then makes every joint start and arrive together. A set-point on the way lies between start and goal, and so does
-    the end of every stop: joint limits need no further check.
-    """
-
-    size = 0
-
-    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
-        super().__init__(smoother, envelope)
-        self.arrived = False
-        self.lost = False
-        """Whether the motion was given up because it made no progress."""
-        self.progress = 0.0
-        """Share of the way from the first start that is done, from 0 to 1."""
-        self._whole_way = 0.0
-        """Distance of the goal from the first start, rad (the joint that goes farthest)."""
-        self._goal: Floats = ()
-        self._from: list[float] = []
-        self._direction: list[float] = []
-        self._planned = False
-        self._share = 1.0
-        """Share of the greatest speed at which the path is planned."""
-        self._begun = False
-        """Whether the arm has moved since the path was planned."""
-        self._t_retry = 0.0
-        """Time until which the arm waits for what is in its way, s."""
-        self._ruckig = Ruckig(1, smoother.dt)
-        self._input = InputParameter(1)
-        self._output = OutputParameter(1)
-
-    def set_goal(self, goal: Floats) -> None:
-        """Set the goal.
-
-        Args:
-            goal: Joint positions (n,), rad.
-
-        Raises:
-            CommandError: If the goal or the path leaves the limits or the workspace; nothing changes.
-        """
-        smoother = self.smoother
-        if len(goal) != smoother.n:
-            raise CommandError(f"move_to needs {smoother.n} joint positions, not {len(goal)}", code="wrong_shape")
-        for i, (x, low, high) in enumerate(zip(goal, smoother.lower, smoother.upper, strict=True)):
-            if not low - 1e-6 <= x <= high + 1e-6:
-                raise CommandError(
-                    f"joint {i} of the goal is {x:.4f} rad; its limits are {low:.4f} to {high:.4f}", code="joint_limit"
-                )
-        inside = [max(low, min(high, x)) for x, low, high in zip(goal, smoother.lower, smoother.upper, strict=True)]
-        self._check_workspace(inside)
-        self._goal = inside
-        self._whole_way = max([abs(x - y) for x, y in zip(inside, smoother.q, strict=True)])
-        self._share = 1.0
-        self.progress = 0.0
-        self.arrived = self.lost = False
-        self._planned = False
-
-    def start(self) -> None:
-        self._planned = False
-
-    def reanchored(self) -> None:
-        self._planned = False
-
-    def accept(self, command: CommandRecord) -> None:
-        raise CommandError("a move_to session takes no commands", code="move_to_session")
-
-    def step(self, now: float) -> None:
-        smoother = self.smoother
-        if self.lost:
-            smoother.stop()
-            return
-        if not self._planned:
-            if now < self._t_retry:
-                self.envelope.limited |= Limited.COLLISION
-            if not smoother.at_rest() or now < self._t_retry:
-                smoother.stop()
-                return
-            self._plan()
-        if self.arrived:
-            smoother.stop()
-            return
-        inputs, output = self._input, self._output
-        try:
-            result = self._ruckig.update(inputs, output)
-        except RuckigError:  # never seen; the same goal can be reached joint by joint
-            if not smoother.reach(self._goal, self.envelope.velocity, self.envelope.allows):
-                smoother.stop()
-            self._planned = False
-            return
-        output.pass_to_input(inputs)
-        if result == Result.Finished:
-            self.arrived = True
-            self.progress = 1.0
-            smoother.adopt(self._goal, [0.0] * smoother.n, [0.0] * smoother.n)
-            return
-        s, ds, dds = output.new_position[0], output.new_velocity[0], output.new_acceleration[0]
-        along = self._direction
-        left = inputs.target_position[0] - s
-        self.progress = max(0.0, 1.0 - left / self._whole_way) if self._whole_way > 0.0 else 0.0
-        q = [x + s * d for x, d in zip(self._from, along, strict=True)]
-        if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.allows_on_path):
-            # Stop, and continue more slowly: at the same speed the same step might be refused for ever.
-            self._planned = False
-            if not self.envelope.blocked:
-                self._share *= _SLOWER
-                return
-            if self._begun:  # else it waits for what is in its way
-                self._share = max(SLOWEST, _SLOWER * self._share)
-            self._t_retry = now + RETRY
-        else:
-            self._begun = True
-
-    def _plan(self) -> None:
-        smoother, envelope = self.smoother, self.envelope
-        self._planned = True
-        self._begun = False
-        self._from = list(smoother.q)
-        delta = [goal - x for goal, x in zip(self._goal, self._from, strict=True)]
-        length = max(map(abs, delta))
-        self.arrived = length < _HERE
-        if self.arrived:
-            self.progress = 1.0
-            return
-        self._direction = along = [d / length for d in delta]
-
-        def slowest(limits: Floats) -> float:
-            return min(limit / abs(d) for limit, d in zip(limits, along, strict=True) if d)
-
-        speed = slowest(envelope.velocity)
-        fastest_tcp = envelope.stop_speed(along, self._samples(self._goal))
-        if fastest_tcp * speed > envelope.goal_tcp_speed:
-            speed = envelope.goal_tcp_speed / fastest_tcp
-        speed *= self._share
-        inputs = self._input
-        inputs.current_position, inputs.current_velocity, inputs.current_acceleration = [0.0], [0.0], [0.0]
-        inputs.target_position = [length]
-        inputs.max_velocity = [speed]
-        inputs.max_acceleration = [slowest(smoother.acceleration)]
-        inputs.max_jerk = [slowest(smoother.jerk)]
-        self._ruckig.reset()
-
-    def _samples(self, goal: Floats) -> list[list[float]]:
-        start = self.smoother.q
-        count = min(_SAMPLES, 1 + ceil(max(abs(b - a) for a, b in zip(start, goal, strict=True)) / _SAMPLE))
-        return [[a + k / count * (b - a) for a, b in zip(start, goal, strict=True)] for k in range(count + 1)]
-
-    def _check_workspace(self, goal: Floats) -> None:
-        """Raise CommandError unless the tcp stays inside the workspace on its way, or only comes back in."""
-        box = self.envelope.workspace
-        if box is None:
-            return
-        fk = self.envelope.kinematics.fk
-        before = fk(self.smoother.q)
-        for q in self._samples(goal):
-            at = fk(q)
-            for x, x0, low, high, axis in zip(at, before, box.lower, box.upper, "xyz", strict=False):
-                if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
-                    raise CommandError(
-                        f"the path leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}",
-                        code="outside_workspace",
-                    )

@@ -27,6 +27,7 @@ from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError
 from ..commands import PathSection
 from ..kinematics.arm import Kinematics
 from ..specs import LimitsSpec
+from .smoothing import stop_distance
 
 __all__ = ["JointPath", "Leg", "Zone", "ZonePlanner", "zones_of"]
 
@@ -68,6 +69,10 @@ class JointPath:
         self._coefficients = np.stack((q[:-1], linear, 0.5 * second[:-1], cubic), axis=-1)
         """(k - 1, n, 4): position at a knot, and the coefficients of the powers of the way from there."""
         self._rows: list[list[list[float]]] = self._coefficients.tolist()
+        rates = self.bounds()[0].max(axis=0)
+        self._rates: list[list[float]] = rates.tolist()
+        """Bounds of |q'| (k - 1, n), and the ways of the joints from the start to each knot that follow (k, n), rad."""
+        self._gone: list[list[float]] = np.cumsum(np.vstack((0.0 * rates[:1], rates * h)), axis=0).tolist()
         self._knots: list[float] = s.tolist()
 
     def at(self, s: float) -> tuple[list[float], list[float], list[float]]:
@@ -99,6 +104,12 @@ class JointPath:
         second = np.stack((2.0 * c, 2.0 * c + 6.0 * h * d))
         rates, curves = (np.stack((x.max(axis=0), -x.min(axis=0))) for x in (first, second))
         return rates, curves, np.abs(6.0 * d)
+
+    def gone(self, s: float) -> list[float]:
+        """Return a bound of each joint's way (n,), rad, from the start to ``s``; differences are bounds, too."""
+        k = min(max(bisect_right(self._knots, s) - 1, 0), len(self._rows) - 1)
+        t = s - self._knots[k]
+        return [x + t * rate for x, rate in zip(self._gone[k], self._rates[k], strict=True)]
 
     def nearest(self, q: Floats, s: float) -> float:
         """Return the parameter near ``s`` at which the path is nearest to ``q`` (n,), rad (Newton's method)."""
@@ -146,6 +157,8 @@ class Zone(NamedTuple):
     jerk: float
     leave: float
     """Greatest v at the end from which the rest of the section can be passed within its limits."""
+    stop_end: float
+    """Parameter at which a stop that begins with the zone ends at most."""
 
 
 def zones_of(
@@ -183,11 +196,14 @@ def zones_of(
     rows: list[list[float]] = np.stack((v, up, down, j), axis=1).tolist()
     parts = _merge(path.s.tolist(), rows)
     zones: list[Zone] = []
-    leave = 0.0  # backwards: no faster than allows to slow down for what follows
+    leave, stop_end = 0.0, path.length  # backwards: no faster than allows to slow down for what follows
     for start, end, (speed, acceleration, braking, jerk) in reversed(parts):
         leave = min(leave, speed)
-        zones.append(Zone(start, end, speed, acceleration, braking, jerk, leave))
-        leave = _reachable(leave, end - start, speed, braking, jerk)
+        enter = _reachable(leave, end - start, speed, braking, jerk)
+        way = stop_distance(enter, braking, jerk)
+        stop_end = start + way if start + way <= end else stop_end  # at most that from the next zone's start
+        zones.append(Zone(start, end, speed, acceleration, braking, jerk, leave, stop_end))
+        leave = enter
     return zones[::-1]
 
 

@@ -1,25 +1,28 @@
-"""A motion along a planned path: straight lines of the tcp, rounded corners, waypoints.
+"""Motions along a path that is known from the start: straight to a goal, or along lines of the tcp and waypoints.
 
-The path arrives whole when the session is opened, and is checked again here, so that no program's mistake gets past the
-limits. Stops are made on the path wherever that is possible, and a motion that was stopped continues from there.
+A planned path arrives whole when the session is opened, and is checked again here, so that no program's mistake gets
+past the limits. Stops are made on the path wherever that is possible, and a motion that was stopped continues from
+there. So a way that was free when it was checked is free for every step of it, and for the stop after it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from math import dist, inf, isfinite
+from math import ceil, dist, inf, isfinite
+from operator import sub
 
 from ..commands import PATH_KNOTS, CommandRecord, PathSection
 from ..errors import CommandError
 from ..specs import LimitsSpec
 from ..types import Limited
+from .collisions import Stop
 from .envelope import UNLIMITED, Envelope
-from .joint import RETRY, SLOWEST, ServoMotion
+from .joint import ServoMotion
 from .path import JointPath, Leg, Zone, ZonePlanner, zones_of
-from .smoothing import JointSmoother
+from .smoothing import JointSmoother, stop_displacement
 
-__all__ = ["PlannedMotion"]
+__all__ = ["PathMotion", "PlannedMotion"]
 
 Floats = Sequence[float]
 
@@ -45,7 +48,26 @@ _TCP_SHARE = 0.99
 """Share of the session's tcp speed for which a path is planned."""
 
 _SLOWER = 0.8
-"""After a step that was too fast for the tcp, the rest is planned at this share of the speed before."""
+"""After a step that was refused, the rest is planned at this share of the speed before."""
+
+_SLOWEST = 0.1
+_RETRY = 0.1
+"""Behind something in its way an arm waits so long, s, and continues at this share of the speed at least."""
+
+
+class _StopOnPath(Stop):
+    """A stop along a path, from one parameter to another."""
+
+    def __init__(self, path: JointPath, start: float, end: float) -> None:
+        self._path, self._start, self._length = path, start, end - start
+        self.ways = self.ways_between(0.0, 1.0)
+
+    def at(self, u: float) -> Floats:
+        return self._path.at(self._start + u * self._length)[0]
+
+    def ways_between(self, u: float, v: float) -> Floats:
+        start, end = self._start + u * self._length, self._start + v * self._length
+        return list(map(sub, self._path.gone(end), self._path.gone(start)))
 
 
 class PlannedMotion(ServoMotion):
@@ -121,10 +143,14 @@ class PlannedMotion(ServoMotion):
         plan = [(path, zones_of(path, limits, velocity, tcp_speed, arm, pause)) for path in paths]
         if not all(min(zone.speed, zone.acceleration, zone.braking, zone.jerk) > 0.0 for _, z in plan for zone in z):
             raise CommandError("the path has a part that no speed is slow enough for", code="bad_path")
+        self._reset()
         self._sections = plan
-        self._before = [0.0]
         for path in paths:
             self._before.append(self._before[-1] + path.length)
+
+    def _reset(self) -> None:
+        """Forget the path and what became of it."""
+        self._sections, self._before = [], [0.0]
         self._section = self._zone = 0
         self._s = self._v = self._a = 0.0
         self._leg = None
@@ -133,9 +159,16 @@ class PlannedMotion(ServoMotion):
         self._waits = 0
         self.arrived = self.lost = self._stopping = False
 
+    def stop_end(self) -> Floats:
+        """Return where a stop that begins now ends (n,), rad, or a little farther along the path."""
+        if self._leg is None or self._at is not self.smoother.q:
+            return self.smoother.stop_end()
+        return self._sections[self._section][0].at(self._stop_parameter())[0]
+
     def start(self) -> None:
         super().start()
-        self._leg = None
+        if self._at is not self.smoother.q:  # else a stop on the path is finished first
+            self._leg = None
 
     def reanchored(self) -> None:
         self._leg = None
@@ -178,6 +211,7 @@ class PlannedMotion(ServoMotion):
     def _follow_leg(self) -> None:
         """Move the set-point by one tick along the plan."""
         smoother = self.smoother
+        before = self._zone, self._leg, self._t, self._s, self._v, self._a
         self._t += smoother.dt
         while self._leg is not None and self._t >= self._leg.duration:
             self._finish_leg(self._leg)
@@ -193,23 +227,31 @@ class PlannedMotion(ServoMotion):
         v, a = self._v, self._a
         dq = [x * v for x in first]
         ddq = [x * a + y * v * v for x, y in zip(first, second, strict=True)]
-        if smoother.adopt(q, dq, ddq, self._allows):
+        if smoother.adopt(q, dq, ddq, None if self._stopping else self._allows):  # a stop was checked before it began
             self._at = smoother.q
             return
-        # It stops joint by joint, comes back to the path, and continues more slowly.
+        self.envelope.note(smoother)
+        self._zone, self._leg, self._t, self._s, self._v, self._a = before
+        moving = self._v > 0.0 or self._a > 0.0
+        # It stops, and continues more slowly.
         if not self.envelope.blocked:
             self._share *= _SLOWER
         else:  # by another arm, which may leave: the whole path was free
-            if self._at:
-                self._share = max(SLOWEST, _SLOWER * self._share)
-            self._waits = round(RETRY / smoother.dt)
-        self._leg, self._at = None, ()
+            if moving:
+                self._share = max(_SLOWEST, _SLOWER * self._share)
+            self._waits = round(_RETRY / smoother.dt)
+        if moving:
+            self._begin_stop()
+            self._follow_leg()
+        else:
+            self._leg = None
+            smoother.stop()
 
     def _begin_leg(self, speed: float) -> bool:
         """Plan from the present place, at ``speed`` (v) without acceleration, to the zone's end; False if it cannot."""
         zone = self._sections[self._section][1][self._zone]
         self._leg = self._planner.through(zone, self._s, speed, self._share)
-        self._t = 0.0
+        self._t, self._v, self._a = 0.0, speed, 0.0
         self._stopping = False
         return self._leg is not None
 
@@ -218,7 +260,8 @@ class PlannedMotion(ServoMotion):
         zone = self._sections[self._section][1][self._zone]
         leg = self._planner.stop(zone, self._s, self._v, self._a)
         if leg is not None:
-            self._leg, self._t, self._stopping = leg, 0.0, True
+            self._leg, self._t = leg, 0.0
+        self._stopping = True
 
     def _finish_leg(self, leg: Leg) -> None:
         """Begin the next leg at the end of this one; none at a rest."""
@@ -252,8 +295,21 @@ class PlannedMotion(ServoMotion):
             self._zone, self._s = 0, 0.0
 
     def _allows(self, smoother: JointSmoother) -> bool:
-        """Return whether the proposed step keeps the tcp's speed limit, and touches nothing."""
-        return self._keeps_tcp_speed(smoother) and self.envelope.keeps_apart()
+        """Return whether the proposed step keeps the tcp's speed limit, and it and its stop touch nothing."""
+        if not self._keeps_tcp_speed(smoother):
+            return False
+        if self.envelope.collisions is None:
+            return True
+        return self.envelope.keeps_apart(_StopOnPath(self._sections[self._section][0], self._s, self._stop_parameter()))
+
+    def _stop_parameter(self) -> float:
+        """Return the parameter at which a stop from the present place ends at most."""
+        zones = self._sections[self._section][1]
+        zone = zones[self._zone]
+        end = self._s + stop_displacement(self._v, self._a, zone.braking, zone.jerk)
+        if end <= zone.end:
+            return end
+        return zones[self._zone + 1].stop_end if self._zone + 1 < len(zones) else zone.end
 
     def _keeps_tcp_speed(self, smoother: JointSmoother) -> bool:
         """Return whether the tcp keeps its speed limit in the proposed step. A stop on the path is no faster."""
@@ -322,17 +378,107 @@ class PlannedMotion(ServoMotion):
 
     def _check_workspace(self, paths: Sequence[JointPath], pause: Callable[[], None]) -> None:
         """Raise CommandError unless the tcp stays inside the workspace, or only comes back in."""
+        if self.envelope.workspace is not None:
+            for path in paths:
+                self._check_tcp(path.samples(2).tolist(), pause)
+
+    def _check_tcp(self, places: Sequence[Floats], pause: Callable[[], None] = lambda: None) -> None:
+        """Raise CommandError unless the tcp is inside the workspace at these places, or no farther outside than now."""
         box = self.envelope.workspace
-        if box is None:
-            return
+        assert box is not None
         fk = self.envelope.kinematics.fk
         begun = fk(self.smoother.q)
-        for path in paths:
-            for q in path.samples(2).tolist():
-                pause()
-                for x, x0, low, high, axis in zip(fk(q), begun, box.lower, box.upper, "xyz", strict=False):
-                    if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
-                        raise CommandError(
-                            f"the path leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}",
-                            code="outside_workspace",
-                        )
+        for q in places:
+            pause()
+            for x, x0, low, high, axis in zip(fk(q), begun, box.lower, box.upper, "xyz", strict=False):
+                if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
+                    raise CommandError(
+                        f"the path leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}",
+                        code="outside_workspace",
+                    )
+
+
+_SAMPLE = 0.05
+_MOST_SAMPLES = 64
+"""A straight way is checked every so many rad, at most this many times: planning must fit into a tick."""
+
+
+class PathMotion(PlannedMotion):
+    """Goes straight to a goal, in joint space, from wherever the arm rests.
+
+    Each joint's limits, seen along the way, bound its speed, acceleration and jerk; so do the session's speed and the
+    tcp's. All joints start and arrive together. A set-point on the way is between start and goal, and so is the end of
+    every stop: joint limits need no further check.
+    """
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        super().__init__(smoother, envelope)
+        self._goal: list[float] = []
+        self._whole_way = 0.0
+        """Distance of the goal from the first start, rad (the joint that goes farthest)."""
+
+    def set_goal(self, goal: Floats) -> None:
+        """Set the goal.
+
+        Args:
+            goal: Joint positions (n,), rad.
+
+        Raises:
+            CommandError: If the goal or the path leaves the limits or the workspace; nothing changes.
+        """
+        smoother = self.smoother
+        if len(goal) != smoother.n:
+            raise CommandError(f"move_to needs {smoother.n} joint positions, not {len(goal)}", code="wrong_shape")
+        for i, (x, low, high) in enumerate(zip(goal, smoother.lower, smoother.upper, strict=True)):
+            if not low - 1e-6 <= x <= high + 1e-6:
+                raise CommandError(
+                    f"joint {i} of the goal is {x:.4f} rad; its limits are {low:.4f} to {high:.4f}", code="joint_limit"
+                )
+        inside = [max(low, min(high, x)) for x, low, high in zip(goal, smoother.lower, smoother.upper, strict=True)]
+        if self.envelope.workspace is not None:
+            self._check_tcp(_between(smoother.q, inside))
+        self._reset()
+        self._goal = inside
+        self._whole_way = max([abs(x - y) for x, y in zip(inside, smoother.q, strict=True)])
+
+    def _returns(self) -> bool:
+        """Make a new plan unless the arm rests on the present one; returns whether there is a way to go."""
+        smoother = self.smoother
+        if self._sections:
+            q = self._sections[0][0].at(self._s)[0]
+            if max(map(abs, map(sub, q, smoother.q))) <= _HERE:
+                return True
+        self._plan()
+        if self.arrived:
+            smoother.stop()
+        return not self.arrived
+
+    def _plan(self) -> None:
+        smoother, envelope = self.smoother, self.envelope
+        delta: list[float] = list(map(sub, self._goal, smoother.q))
+        length = max(map(abs, delta))
+        self.arrived = length < _HERE
+        if self.arrived:
+            return
+        along = [d / length for d in delta]
+
+        def slowest(limits: Floats) -> float:
+            return min(limit / abs(d) for limit, d in zip(limits, along, strict=True) if d)
+
+        speed = slowest(envelope.velocity)
+        fastest_tcp = envelope.stop_speed(along, _between(smoother.q, self._goal))
+        if fastest_tcp * speed > envelope.goal_tcp_speed:
+            speed = envelope.goal_tcp_speed / fastest_tcp
+        acceleration = slowest(smoother.acceleration)
+        path = JointPath(PathSection((0.0, length), (tuple(smoother.q), tuple(self._goal))))
+        zone = Zone(0.0, length, speed, acceleration, acceleration, slowest(smoother.jerk), 0.0, length)
+        self._sections = [(path, [zone])]
+        whole = max(self._whole_way, length)
+        self._before = [whole - length, whole]
+        self._s = 0.0
+
+
+def _between(start: Floats, goal: Floats) -> list[list[float]]:
+    """Return joint positions (n,), rad, on the straight way from ``start`` to ``goal``."""
+    count = min(_MOST_SAMPLES, 1 + ceil(max(abs(b - a) for a, b in zip(start, goal, strict=True)) / _SAMPLE))
+    return [[a + k / count * (b - a) for a, b in zip(start, goal, strict=True)] for k in range(count + 1)]

@@ -26,8 +26,8 @@ from .collisions import CollisionGuard
 from .compliance import Compliance
 from .controllers import Controller
 from .envelope import Envelope
-from .joint import ChunkMotion, JointTargetMotion, JointVelocityMotion, PathMotion, ServoMotion
-from .planned import PlannedMotion
+from .joint import ChunkMotion, JointTargetMotion, JointVelocityMotion, ServoMotion
+from .planned import PathMotion, PlannedMotion
 from .report import ServoReport
 from .smoothing import JointSmoother
 from .torque import BRAKE_LIMIT, MassMatrix, TorqueMotion
@@ -109,7 +109,7 @@ class Servo:
         }
         self._path = PathMotion(smoother, envelope)
         self._planned = PlannedMotion(smoother, envelope)
-        self._whole: PathMotion | PlannedMotion | None = None
+        self._whole: PlannedMotion | None = None
         """The one motion of a session that takes no commands; None in a session that does."""
         self._session: Session | None = None
         self._course = _Course()
@@ -146,6 +146,10 @@ class Servo:
     def smoother(self) -> JointSmoother:
         """The set-point."""
         return self._smoother
+
+    def stop_end(self) -> Floats:
+        """Return where a stop of the set-point that begins now ends (n,), rad."""
+        return self._smoother.stop_end() if self._whole is None else self._whole.stop_end()
 
     def set_guard(self, guard: CollisionGuard | None) -> None:
         """Keep the arm off what ``guard`` checks, from the next session on."""
@@ -515,12 +519,12 @@ class Servo:
         return Setpoint(smoother.q, smoother.dq, smoother.ddq, None, q_from)
 
     def _brake(self) -> None:
-        """Advance the stop by one tick: along a planned path, by torques, or joint by joint."""
+        """Advance the stop by one tick: along a path, by torques, or joint by joint."""
         by_torques = self._torque.active and not self._compliance.active
         if by_torques and self._torque.brake():
             self._leave_torques()
             by_torques = False
-        if not by_torques and not (self._whole is self._planned and self._planned.brake()):
+        if not by_torques and not (self._whole is not None and self._whole.brake()):
             self._smoother.stop()
 
     def _prepare_compliance(self, motion: ServoMotion | None) -> None:
@@ -539,7 +543,7 @@ class Servo:
             elif self._course.braking > BRAKE_LIMIT:
                 compliance.active = False  # torques brake it
 
-    def _report_whole(self, motion: PathMotion | PlannedMotion) -> None:
+    def _report_whole(self, motion: PlannedMotion) -> None:
         """Report how far the motion of the session is."""
         report = self.report
         report.arrived = motion.arrived and (not self._compliance.active or self._torque.still)

@@ -32,10 +32,12 @@ __all__ = [
     "Guard",
     "JointSmoother",
     "speed_for",
+    "stop_at",
     "stop_displacement",
     "stop_distance",
     "stop_peak",
     "stop_phases",
+    "stop_pieces",
     "stop_step",
 ]
 
@@ -104,24 +106,36 @@ def stop_phases(v: float, a: float, A: float, J: float) -> tuple[float, float, f
     return jerk, build, build + constant, build + constant + release
 
 
+def stop_pieces(q: float, v: float, a: float, A: float, J: float) -> list[tuple[float, ...]]:
+    """Return the phases of the stop from (q, v, a), and the rest after it, for :func:`stop_at`; |a| <= A.
+
+    Each is the time at which it ends, the one at which it begins, s, and position, speed, acceleration and jerk there.
+    """
+    jerk, *ends = stop_phases(v, a, A, J)
+    pieces, begin = [], 0.0
+    for end, j in zip(ends, (jerk, 0.0, -jerk), strict=True):
+        pieces.append((end, begin, q, v, a, j))
+        q, v, a = _moved(q, v, a, j, end - begin)
+        begin = end
+    return [*pieces, (inf, begin, q, 0.0, 0.0, 0.0)]
+
+
+def stop_at(pieces: list[tuple[float, ...]], t: float) -> tuple[float, float, float]:
+    """Return position, speed and acceleration ``t`` seconds into a stop."""
+    begin, q, v, a, j = next(state for end, *state in pieces if t < end)
+    return _moved(q, v, a, j, t - begin)
+
+
 def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tuple[float, float, float]:
     """Return position, speed and acceleration ``dt`` seconds into the stop from (q, v, a); |a| <= A.
 
     The same as Ruckig's velocity interface with target 0, for the case that Ruckig fails.
     """
-    if v + 0.5 * a * abs(a) / J < 0.0:
-        q, v, a = stop_step(-q, -v, -a, A, J, dt)
-        return -q, -v, -a
-    build, constant, release = _phases(v, a, A, J)
-    for jerk, duration in ((-J, build), (0.0, constant), (J, release)):
-        step = min(dt, duration)
-        q += step * (v + step * (0.5 * a + step * jerk / 6.0))
-        v += step * (a + 0.5 * step * jerk)
-        a += step * jerk
-        dt -= step
-        if dt <= 0.0:
-            return q, v, a
-    return q, 0.0, 0.0
+    return stop_at(stop_pieces(q, v, a, A, J), dt)
+
+
+def _moved(q: float, v: float, a: float, j: float, t: float) -> tuple[float, float, float]:
+    return q + t * (v + t * (0.5 * a + t * j / 6.0)), v + t * (a + 0.5 * t * j), a + t * j
 
 
 def _phases(v: float, a: float, A: float, J: float) -> tuple[float, float, float]:
@@ -240,14 +254,13 @@ class JointSmoother:
     def adopt(self, q: Floats, dq: Floats, ddq: Floats, guard: Guard | None = None) -> bool:
         """Move to a set-point that was computed elsewhere inside the limits (a planned path).
 
-        A step that the guard refuses becomes a stop of all joints; returns whether it was not refused.
+        False, and nothing has moved, when the guard refuses.
         """
         self.q_next, self.dq_next, self.ddq_next = list(q), list(dq), list(ddq)
         self.held_back = self._none
         self.guarded = guard is not None and not guard(self)
-        if self.guarded:
-            self._propose_velocity(self._zeros)
-        self._commit()
+        if not self.guarded:
+            self._commit()
         return not self.guarded
 
     def at_rest(self) -> bool:

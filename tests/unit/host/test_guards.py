@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from servo_kit import Bench
 from specs import panda
 
 from hal.commands import NO_INBOX, Session
@@ -39,10 +40,18 @@ def stop(jerk: Any) -> Any:
     return SET + [np.copysign(stop_distance(abs(v), A, J), v) for v, A, J in limits]
 
 
-def test_an_arm_that_follows_positions_is_at_its_set_point() -> None:
+def test_an_arm_that_follows_positions_is_at_its_set_point_and_may_stop_on_a_path() -> None:
+    share = float(np.abs(SPEED / SPEC.limits.velocity).max())
+    bench = Bench(SPEC, rate_hz=1000.0, speed=share, move_to=(SET + 1.5 * SPEED).tolist())
+    bench.run(0.7)
+    here, foretold = np.array(bench.q), bench.servo.stop_end()
+    bench.stops += 1
+    bench.until_rest(0.5)
+    assert bench.q == pytest.approx(foretold, abs=1e-6)
     q, end = elsewhere(RobotStatus.FOLLOWING, ControlMode.POSITION)
     assert np.array_equal(q, SET)
-    assert end == pytest.approx(stop(SPEC.limits.jerk) + 0.004 * SPEED)
+    assert end - 0.004 * SPEED - SET == pytest.approx(bench.q - here, abs=1e-5)
+    assert (np.abs(end - SET) >= np.abs(stop(SPEC.limits.jerk) - SET) + 0.004 * np.abs(SPEED) - 1e-9).all()
 
 
 @pytest.mark.parametrize("at", [SET, SET + [0.0, 1.2, 0.0, 0.8, 0.0, 0.0, 0.0]])  # the second one: stretched out
@@ -68,7 +77,7 @@ def test_an_arm_that_may_be_moved_by_hand_is_where_it_is_measured() -> None:
 def test_an_arm_that_was_lost_on_its_way_still_stops(status: RobotStatus) -> None:
     q, end = elsewhere(status, ControlMode.POSITION)
     assert np.array_equal(q, MEASURED)
-    assert end == pytest.approx(stop(SPEC.limits.jerk) + 0.004 * SPEED)
+    assert np.array_equal(end, elsewhere(RobotStatus.FOLLOWING, ControlMode.POSITION)[1])
 
 
 def test_an_arm_that_follows_torques_stops_in_the_way_of_a_tenth_of_a_second() -> None:

@@ -86,6 +86,10 @@ def test_an_arm_that_begins_inside_the_margin_may_leave_it(panda: RobotSpec, col
     collisions.check_motion([inside, panda.home])
     with pytest.raises(CollisionError):
         collisions.check_motion([inside, inside + [0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    parted = inside - [0.0, 0.004, 0.0, 0.0, 0.0, 0.0, 0.0]  # and still inside
+    assert collisions.check(parted)
+    with pytest.raises(CollisionError):
+        collisions.check_motion([inside, parted, inside])
 
 
 def slides(folder: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +43,11 @@ def finish(bench: Bench, most: float = 10.0) -> float:
         bench.tick()
         assert bench.now - begun < most
     return bench.now - begun
+
+
+def along(q: Sequence[float]) -> float:
+    """Way of the tcp along the line at joint positions ``q``, m."""
+    return float(np.subtract(ARM.fk(q)[:3], START[:3]) @ WAY / np.linalg.norm(WAY))
 
 
 def off_line(bench: Bench) -> tuple[float, float]:
@@ -87,7 +93,7 @@ def test_a_stop_is_made_on_the_line_and_the_motion_continues_on_it(cause: str) -
         bench.begin()
         for _ in range(3):
             bench.run(numbers.uniform(0.0, 0.5))
-            progress = bench.servo.report.progress
+            progress, foretold = bench.servo.report.progress, bench.servo.stop_end()
             if cause == "deadman":
                 bench.release()
             elif cause == "trip":
@@ -96,6 +102,7 @@ def test_a_stop_is_made_on_the_line_and_the_motion_continues_on_it(cause: str) -
                 bench.lose()
             bench.until_rest(0.5)
             assert progress <= bench.servo.report.progress < progress + 0.2
+            assert along(bench.q) - 1e-6 < along(foretold) < along(bench.q) + 0.02
             assert bench.status in (RobotStatus.HOLDING, RobotStatus.TRIPPED)
             bench.run(0.05)
             if cause == "deadman":
