@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 _TASK = "__index_level_0__"
-"""LeRobot's name of the column of texts in ``meta/tasks.parquet``."""
+"""LeRobot 0.4's name of the column of texts in ``meta/tasks.parquet``; 0.6's is ``task``, and it reads both."""
 
 
 class _Info(Model):
@@ -207,5 +207,6 @@ def read_tasks(path: Path) -> list[str]:
     import pyarrow.parquet as pq
 
     table = pq.ParquetFile(path).read()
-    numbered = sorted(zip(table["task_index"].to_pylist(), table[_TASK].to_pylist(), strict=True))
+    texts = table["task" if "task" in table.column_names else _TASK]
+    numbered = sorted(zip(table["task_index"].to_pylist(), texts.to_pylist(), strict=True))
     return [text for _, text in numbered]

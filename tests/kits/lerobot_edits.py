@@ -62,7 +62,9 @@ def edit_as_lerobot(
             for number, episode in enumerate(chosen):
                 columns[key] += _values(key, number, starts[number], episode, add)
     _write(out / f"data/chunk-000/file-{file:03d}.parquet", pa.table(columns, _schema(features)))
-    _write(out / "meta/tasks.parquet", tasks_table(tasks))
+    numbered = tasks_table(tasks)
+    texts = ["task" if name != "task_index" else name for name in numbered.column_names]  # as version 0.6 has it
+    _write(out / "meta/tasks.parquet", numbered.rename_columns(texts))
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     rows = []
     for number, episode in enumerate(chosen):
