@@ -41,6 +41,8 @@ class ModelRun:
     moved: float = 0.0
     """Largest distance of the tcp from where it began, m."""
     trip: Trip = Trip.NONE
+    width_min: float = 0.0
+    """Least width of the gripper, m."""
     widths: tuple[float, float] | None = None
     """Width of the gripper when open and when closed, m; None without a gripper."""
     notes: tuple[str, ...] = ()
@@ -87,7 +89,8 @@ def run_model(entry: dict[str, Any], engine: str, poses: int = 100, tour: float 
                     break
         gripper = arm.gripper
         if gripper is not None:
-            result.widths = gripper.open().width, gripper.move(0.0).width
+            result.widths = gripper.open().width, gripper.move(gripper.width_min).width
+            result.width_min = gripper.width_min
     return result
 
 

@@ -29,11 +29,10 @@ Images = Mapping[str, NDArray[Any]]
 """The pictures of one capture, by the names of their streams."""
 Key = TypeVar("Key", bound=Hashable)
 
-_NUMBER = struct.Struct("<Q")
 _HEADER = struct.Struct(
     "<QddQd7d"
 )  # number, t, t_device, seq, skew, position and quaternion of the camera; NaN: unknown
-_WRITTEN, _READ, _TALLY = 0, 8, 16  # offsets in the ring's head
+_WRITTEN, _READ, _TALLY = 0, 1, 2  # places of the numbers in the ring's head; the tally has two
 _ALIGNMENT = 64
 _SLOTS = 4
 """Of a camera's ring: a reader has two periods of the camera to copy a frame before its slot is written again."""
@@ -61,12 +60,15 @@ class ArrayRing(Generic[Key]):
             slots: Number of slots.
         """
         self._buffer = buffer
+        self._head = buffer[:_ALIGNMENT].cast("Q")  # each is stored at once; struct.pack_into writes zeros before it
         self.slots: list[dict[Key, NDArray[Any]]] = []
         """The arrays of each slot; number k uses slot ``k % len(slots)``."""
         self._starts: list[int] = []
+        self._numbers: list[memoryview] = []
         place = _ALIGNMENT
         for _ in range(slots):
             self._starts.append(place)
+            self._numbers.append(buffer[place : place + 8].cast("Q"))
             place += _align(_HEADER.size)
             views = {}
             for key, (shape, dtype) in arrays.items():
@@ -80,18 +82,15 @@ class ArrayRing(Generic[Key]):
         payload = sum(_align(math.prod(shape) * np.dtype(dtype).itemsize) for shape, dtype in arrays.values())
         return _ALIGNMENT + slots * (_align(_HEADER.size) + payload)
 
-    def _get(self, place: int) -> int:
-        return int(_NUMBER.unpack_from(self._buffer, place)[0])
-
     @property
     def written(self) -> int:
         """Number of the newest finished slot; 0 before the first."""
-        return self._get(_WRITTEN)
+        return self._head[_WRITTEN]
 
     @property
     def waiting(self) -> int:
         """Number of finished slots that were not read."""
-        return self._get(_WRITTEN) - self._get(_READ)
+        return max(0, self._head[_WRITTEN] - self._head[_READ])  # both are 0 once the memory is freed
 
     @property
     def is_full(self) -> bool:
@@ -103,7 +102,7 @@ class ArrayRing(Generic[Key]):
     def open_slot(self) -> dict[Key, NDArray[Any]]:
         """Mark the next slot as unfinished and return its arrays, to be filled. Repeatable before :meth:`publish`."""
         which = (self.written + 1) % len(self.slots)
-        _NUMBER.pack_into(self._buffer, self._starts[which], 0)
+        self._numbers[which][0] = 0
         return self.slots[which]
 
     def publish(
@@ -122,27 +121,27 @@ class ArrayRing(Generic[Key]):
             The slot's number.
         """
         number = self.written + 1
-        start = self._starts[number % len(self.slots)]
+        which = number % len(self.slots)
         place = _UNKNOWN_POSE if pose is None else (*pose.position.tolist(), *pose.orientation.tolist())
-        _HEADER.pack_into(self._buffer, start, 0, t, t_device, seq, math.nan if skew is None else skew, *place)
-        _NUMBER.pack_into(self._buffer, start, number)
-        _NUMBER.pack_into(self._buffer, _WRITTEN, number)
+        values = (0, t, t_device, seq, math.nan if skew is None else skew, *place)
+        _HEADER.pack_into(self._buffer, self._starts[which], *values)
+        self._numbers[which][0] = number
+        self._head[_WRITTEN] = number
         return number
 
     # Reader of every slot, in place.
 
     def oldest(self) -> dict[Key, NDArray[Any]] | None:
         """Return the arrays of the oldest slot that was not read; None if there is none."""
-        return self.slots[(self._get(_READ) + 1) % len(self.slots)] if self.waiting else None
+        return self.slots[(self._head[_READ] + 1) % len(self.slots)] if self.waiting else None
 
     def release_oldest(self) -> None:
         """Mark the oldest slot as read, so that the writer may use it again."""
-        _NUMBER.pack_into(self._buffer, _READ, self._get(_READ) + 1)
+        self._head[_READ] += 1
 
     def release_all(self) -> int:
         """Mark every slot as read; returns the number of the newest one."""
-        newest = self.written
-        _NUMBER.pack_into(self._buffer, _READ, newest)
+        self._head[_READ] = newest = self.written
         return newest
 
 
@@ -184,11 +183,10 @@ class FrameRing(ArrayRing[str]):
                 return None
             number = after + 1 if every else number
             which = number % len(self.slots)
-            start = self._starts[which]
-            before, t, t_device, seq, skew, *pose = _HEADER.unpack_from(self._buffer, start)
+            before, t, t_device, seq, skew, *pose = _HEADER.unpack_from(self._buffer, self._starts[which])
             copies = {name: image.copy() for name, image in self.slots[which].items()}
-            if before == number and self._get(start) == number:
-                _NUMBER.pack_into(self._buffer, _READ, number)
+            if before == number and self._numbers[which][0] == number:
+                self._head[_READ] = number
                 return number, RawFrame(
                     t,
                     t_device,
@@ -218,11 +216,11 @@ class FrameRing(ArrayRing[str]):
     @property
     def tally(self) -> CameraTally:
         """Sets of frames that the writer kept back."""
-        return CameraTally(*struct.unpack_from("<2Q", self._buffer, _TALLY))
+        return CameraTally(*self._head[_TALLY : _TALLY + 2])
 
     @tally.setter
     def tally(self, tally: CameraTally) -> None:
-        struct.pack_into("<2Q", self._buffer, _TALLY, *tally)
+        self._head[_TALLY], self._head[_TALLY + 1] = tally
 
 
 def frame_rings(buffer: memoryview, specs: Sequence[CameraSpec]) -> dict[str, FrameRing]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import multiprocessing
 import struct
 import threading
 from collections.abc import Callable
@@ -212,3 +213,24 @@ def test_slots_are_used_in_place_and_in_turn() -> None:
         reader.release_oldest()
         assert not writer.is_full
     assert reader.oldest() is None
+
+
+def publish_rows(ring: ArrayRing[str]) -> None:
+    for _ in range(300_000):
+        ring.open_slot()
+        ring.publish()
+
+
+def test_the_number_of_the_newest_slot_never_goes_back() -> None:
+    """In two processes: a number that is stored in two steps is zero between them, and a reader runs ahead for ever."""
+    arrays = {"row": ((1,), np.float64)}
+    memory = memoryview(mmap.mmap(-1, ArrayRing.count_bytes(arrays, 8)))
+    writer, reader = ArrayRing(memory, arrays, 8), ArrayRing(memory, arrays, 8)
+    process = multiprocessing.get_context("fork").Process(target=publish_rows, args=(writer,), daemon=True)
+    process.start()
+    newest = 0
+    while process.is_alive():
+        number = reader.written
+        assert number >= newest
+        newest = number
+    assert reader.written == 300_000
