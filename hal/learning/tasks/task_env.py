@@ -46,6 +46,8 @@ _BOUND = 2.0
 """Bound of the positions in an observation, m."""
 _GAIN = 6.0
 """Velocity of a scripted motion for each metre or radian to its goal, 1/s; also that which keeps the hand upright."""
+_LONGEST = 300
+"""Most steps of one way of a scripted solution: those of the longest episode."""
 _ARRIVED = (0.004, 0.03)
 """Distance and angle from its goal at which a scripted motion has arrived, m and rad."""
 _STILL = 0.2
@@ -195,8 +197,8 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
         return Pose.from_rpy((x, y, height), (0.0, 0.0, self.np_random.uniform(-_TURN, _TURN)))
 
     def go(self, position: ArrayLike, yaw: float, grip: float) -> Iterator[Action]:
-        """Yield actions until the tcp is at a position (3,), m, and the hand at a turn about z, rad."""
-        while True:
+        """Yield actions until the tcp is at a position (3,), m, and the hand at a turn about z, rad; at most 15 s."""
+        for _ in range(_LONGEST):
             off = np.append(np.subtract(position, self.tcp.position), _fold(yaw - self.yaw(self.tcp), 2.0 * math.pi))
             if np.linalg.norm(off[:3]) < _ARRIVED[0] and abs(off[3]) < _ARRIVED[1]:
                 return
