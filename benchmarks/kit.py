@@ -148,7 +148,7 @@ def sum_of_programs(count: int, *words: str) -> float:
 @contextlib.contextmanager
 def emulated_franka(robot: str, host: str, *options: str) -> Iterator[str]:
     """Run an emulated Franka in a process of its own; yield its address."""
-    command = [sys.executable, "-m", "hal.drivers.franka.emulator", "--robot", robot, "--host", host, "--quiet"]
+    command = [sys.executable, "-m", "hal_emulators.franka", "--robot", robot, "--host", host, "--quiet"]
     quiet = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([*command, *options], **quiet) as process:  # type: ignore[call-overload]
         try:

@@ -18,7 +18,7 @@ import numpy as np
 
 import hal
 from hal.config import load
-from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
+from hal_emulators.realsense import SoftwareCamera, emulated_context
 
 from .kit import Table, cpu, ms, ticks_missed
 

@@ -30,6 +30,10 @@ from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 STRICT = os.environ.get("HAL_TEST_STRICT", "") not in ("", "0")
 PYTHON = sys.version_info[:2]
 TESTS = Path(__file__).resolve().parent
+# pyproject.toml adds this for pytest itself; programs that a test starts find it here.
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(TESTS.parent / "packages/emulators/src"), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
 
 FAST = {
     "unit": "one part of the package at a time",

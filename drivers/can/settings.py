@@ -78,7 +78,7 @@ def emulator_remedy(source: str) -> str:
     """
     known = bool(source) and not source.startswith("<")
     file = shlex.quote(source) if known else "FILE, with the rig in a file"
-    return f"start the emulator in another terminal: python -m hal.drivers.can.emulator --config {file}"
+    return f"start the emulator in another terminal: hal emulate can --config {file}"
 
 
 # Values.

@@ -374,7 +374,7 @@ _UNANSWERED = Fault(
     f"the robot ended a motion, or was to, and did not answer for {LONGEST_CALL:g} s: the connection was closed",
     "the driver connects again; look at Desk if the robot does not answer then",
 )
-_START_EMULATOR = "start it in another terminal: python -m hal.drivers.franka.emulator --host {} (--help for more)"
+_START_EMULATOR = "start it in another terminal: hal emulate franka --host {} (--help for more)"
 
 
 class ArmConnection:

@@ -46,7 +46,7 @@ PATIENCE = 5.0
 """s for the robot to answer, including the start of the process that connects to it; it needs a fraction of that."""
 _PORT_ERRORS = {PortState.REFUSED: REFUSED, PortState.SILENT: UNREACHABLE, PortState.NO_ROUTE: NO_ROUTE}
 _HAND_LIBRARY = "panda_py"
-_START_EMULATOR = "start it in another terminal: python -m hal.drivers.franka.emulator --host {host} (--help for more)"
+_START_EMULATOR = "start it in another terminal: hal emulate franka --host {host} (--help for more)"
 _IN_USE = "end the program that uses this arm, also on other computers; if there is none, restart the robot in Desk"
 _SAMPLES = 50
 """States, 1 ms apart, from which the noise of an arm at rest is measured."""

@@ -58,7 +58,7 @@ class RealSenseCamera(CameraDriver):
     """A RealSense on USB, a recording, or an emulated camera, as ``real:`` of the rig file selects.
 
     The options are those of :class:`.options.RealSenseSettings`. The faults that ``inject`` takes, for an emulated
-    camera, are the fields of :class:`.emulator.settings.CameraFaults`.
+    camera, are the fields of ``hal_emulators.realsense.CameraFaults``.
     """
 
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:

@@ -71,7 +71,7 @@ class RealSenseDevice:
         """Return the library's context, and the emulated camera in it; None for the latter if the camera is real."""
         if self._settings.emulated is None:
             return rs.context(), None
-        from .emulator import SoftwareCamera, emulated_context
+        from hal_emulators.realsense import SoftwareCamera, emulated_context
 
         context, emulated = emulated_context(), SoftwareCamera(spec, **self._settings.emulated)
         emulated.attach(context)
@@ -193,7 +193,7 @@ class RealSenseDevice:
         return f"{camera} was reset, and will be back in some seconds"
 
     def inject(self, **faults: Any) -> None:
-        """Set faults of an emulated camera (:class:`.emulator.settings.CameraFaults`).
+        """Set faults of an emulated camera (``hal_emulators.realsense.CameraFaults``).
 
         Raises:
             NotSupported: For a real camera or a recording.

@@ -19,8 +19,6 @@ from hal.config.schema import Flag, Quantity, Seconds, Strict, ValueProblem, des
 from hal.errors import CommandError, ConfigError, NotSupported
 from hal.specs import CameraSpec
 
-from .emulator import Emulation
-
 __all__ = [
     "COLOR_FORMATS",
     "FORMATS",
@@ -91,7 +89,12 @@ def _check_emulated(value: Any) -> Any:
     if value is None or value is False:
         return None
     try:
+        from hal_emulators.realsense import Emulation
+
         Emulation.from_options(value)
+    except ModuleNotFoundError:
+        remedy = "pip install -e packages/emulators, in the repository of robot-hal"
+        raise ValueProblem(f"needs the emulators, a package of their own: {remedy}", "missing_package") from None
     except CommandError as error:
         raise ValueProblem(str(error), error.code) from None
     return {} if value is True else dict(value)
@@ -119,7 +122,7 @@ class RealSenseSettings(Strict):
     paced: Flag = True
     """Whether it is played at the rate it was recorded; otherwise each ``read`` takes the next frame, without loss."""
     emulated: Annotated[dict[str, Any] | None, BeforeValidator(_check_emulated)] = None
-    """Fields of :class:`.emulator.Emulation`, for an emulated camera instead of a real one."""
+    """Fields of ``hal_emulators.realsense.Emulation``, for an emulated camera instead of a real one."""
 
     @model_validator(mode="after")
     def _check_source(self) -> RealSenseSettings:

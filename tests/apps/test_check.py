@@ -50,9 +50,7 @@ def test_what_fails_is_shown_with_its_remedy_and_is_the_exit_status() -> None:
     lines = done.stdout.splitlines()
     (at_line,) = [k for k, line in enumerate(lines) if line.startswith("FAIL")]
     assert "arm: robot" in lines[at_line]
-    assert (
-        lines[at_line + 1].strip().startswith("-> start it in another terminal: python -m hal.drivers.franka.emulator")
-    )
+    assert lines[at_line + 1].strip().startswith("-> start it in another terminal: hal emulate franka")
 
 
 @needs_libraries

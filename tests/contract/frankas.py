@@ -62,7 +62,7 @@ class FR3:
 def franka_hand() -> Iterator[GripperBench]:
     """In real time, as the emulated hand is."""
     pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
-    from hal.drivers.franka.emulator.hand_fingers import FULL_WIDTH
+    from hal_emulators.franka.hand_fingers import FULL_WIDTH
 
     from ..wire.hand_kit import HandBench
 

@@ -23,9 +23,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from hal.config.loader import load
-from hal.drivers.can.emulator.console import EmulatorControl
-from hal.drivers.can.emulator.server import CanEmulator, EmulatedArm
 from hal.specs import RobotSpec
+from hal_emulators.can.console import EmulatorControl
+from hal_emulators.can.server import CanEmulator, EmulatedArm
 
 __all__ = ["CanBench", "EmulatorProcess", "can_overrides", "emulated_arm"]
 
@@ -79,7 +79,7 @@ def emulated_arm(
 
 
 class EmulatorProcess:
-    """A running ``python -m hal.drivers.can.emulator`` on a bus of its own."""
+    """A running ``python -m hal_emulators.can`` on a bus of its own."""
 
     def __init__(self, rig: str, *more: str, arms: tuple[str, ...] = ("arm",)) -> None:
         """Start it and wait until it is ready. Raises RuntimeError, with its output, if it is not in time."""
@@ -89,7 +89,7 @@ class EmulatorProcess:
         """Its output so far."""
         options = [word for value in self.overrides for word in ("--set", value)]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hal.drivers.can.emulator", "--config", rig, *options],
+            [sys.executable, "-m", "hal_emulators.can", "--config", rig, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

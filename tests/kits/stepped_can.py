@@ -26,13 +26,13 @@ from hal.clock import LockStepClock
 from hal.commands import Command
 from hal.config.loader import load
 from hal.drivers.can import damiao_chain, piper_link
-from hal.drivers.can.emulator import console, server
 from hal.errors import ConnectionLost, HalError, MotionStopped, RobotFault
 from hal.gripper import Gripper
 from hal.host import cycle as host_cycle
 from hal.host.hosts import LocalHost
 from hal.robot import Robot
 from hal.specs import GroupSpec, RobotSpec
+from hal_emulators.can import console, server
 
 __all__ = ["SteppedArm", "SteppedEmulator", "stepped_arm", "take_for_off"]
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from math import nan
 
 from hal.config.data_files import find_data
-from hal.drivers.franka.emulator.arm import ArmReply, EmulatedArm, RequestHandler, RobotFiles
-from hal.drivers.franka.emulator.journal import Journal
-from hal.drivers.franka.emulator.plant import IdealPlant, Plant, RigidBody
-from hal.drivers.franka.emulator.protocol import PROTOCOLS, STATE, CommandPacket, Controller, Generator
 from hal.drivers.franka.limits import LIMITS
+from hal_emulators.franka.arm import ArmReply, EmulatedArm, RequestHandler, RobotFiles
+from hal_emulators.franka.journal import Journal
+from hal_emulators.franka.plant import IdealPlant, Plant, RigidBody
+from hal_emulators.franka.protocol import PROTOCOLS, STATE, CommandPacket, Controller, Generator
 
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 URDF = find_data("robots", "fr3.urdf")

@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from hal.drivers.franka.emulator.control import EmulatorControl
 from hal.drivers.franka.flags import FLAGS
+from hal_emulators.franka.control import EmulatorControl
 
 Report = dict[str, Any]
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hal.drivers.franka.emulator.control import EmulatorControl
+from hal_emulators.franka.control import EmulatorControl
 
 __all__ = ["Client", "Emulator", "free_host", "run_client"]
 
@@ -94,7 +94,7 @@ class Emulator:
         self.lines: list[str] = []
         """Its output so far."""
         self._ready = threading.Event()
-        command = [sys.executable, "-m", "hal.drivers.franka.emulator", "--robot", robot, "--host", self.host, *options]
+        command = [sys.executable, "-m", "hal_emulators.franka", "--robot", robot, "--host", self.host, *options]
         if not hand:
             command.append("--no-hand")
         began = time.monotonic()

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 from hal.driver import GripperReading
-from hal.drivers.franka.emulator.hand import HandServer
 from hal.drivers.franka.hand import FrankaHand
 from hal.errors import ConnectionLost
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
+from hal_emulators.franka.hand import HandServer
 
 from .franka_kit import free_host
 

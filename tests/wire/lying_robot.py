@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from hal.drivers.franka.emulator.protocol import STATE
+from hal_emulators.franka.protocol import STATE
 
 CONNECT, MOVE, STOP = 0, 1, 2
 GET_MODEL = 11  # of protocol 10

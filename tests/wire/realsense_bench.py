@@ -21,8 +21,8 @@ from hal.types import Frame
 pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install 'robot-hal[realsense]'")
 
 from hal.drivers.realsense.camera import RealSenseCamera
-from hal.drivers.realsense.emulator import write_recording
-from hal.drivers.realsense.emulator.pictures import EmulatedImages, make_streams
+from hal_emulators.realsense import write_recording
+from hal_emulators.realsense.pictures import EmulatedImages, make_streams
 
 SIZE = (640, 480)
 PATIENCE = 15.0

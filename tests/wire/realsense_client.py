@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyrealsense2 as rs
 
-from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
 from hal.specs import CameraSpec
 from hal.testing import camera_spec
+from hal_emulators.realsense import SoftwareCamera, emulated_context
 
 PATIENCE = 10.0
 """s within which a first picture comes on a busy machine."""

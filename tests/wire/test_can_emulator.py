@@ -9,7 +9,7 @@ from can_kit import EmulatorProcess
 from waiting import wait_until
 
 import hal
-from hal.drivers.can.emulator.__main__ import main
+from hal_emulators.can.__main__ import main
 
 
 def test_commands_are_typed_at_the_prompt_or_sent_to_the_control_port() -> None:

@@ -8,10 +8,10 @@ from math import inf, nan, sqrt
 import numpy as np
 import pytest
 
-from hal.drivers.franka.emulator.motion import MotionSample, at_rest
-from hal.drivers.franka.emulator.plant import FLANGE_TO_HAND, IdealPlant, LaggingPlant, Plant, RigidBody, arm_only
-from hal.drivers.franka.emulator.protocol import Generator
 from hal.drivers.franka.flags import FLAGS, flag_index
+from hal_emulators.franka.motion import MotionSample, at_rest
+from hal_emulators.franka.plant import FLANGE_TO_HAND, IdealPlant, LaggingPlant, Plant, RigidBody, arm_only
+from hal_emulators.franka.protocol import Generator
 
 from .arm_kit import HOME, URDF, ZERO, Bench
 
@@ -257,7 +257,7 @@ def pushed(plant: Plant) -> float:
 
 def test_two_physics_engines_agree_roughly_on_what_a_torque_does() -> None:
     pytest.importorskip("pybullet", reason="needs pybullet (pip install pybullet)")
-    from hal.drivers.franka.emulator.plant import PyBulletPlant
+    from hal_emulators.franka.plant import PyBulletPlant
 
     body = RigidBody(URDF)
     bullet = PyBulletPlant(body, URDF, HOME)

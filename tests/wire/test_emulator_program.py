@@ -15,11 +15,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from hal.drivers.franka.emulator.control import EmulatorControl
+from hal_emulators.franka.control import EmulatorControl
 
 from .franka_kit import Client, Emulator, run_client
 
-PROGRAM = [sys.executable, "-m", "hal.drivers.franka.emulator"]
+PROGRAM = [sys.executable, "-m", "hal_emulators.franka"]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_invalid_options_are_refused() -> None:
 
 
 def test_commands_from_the_shell(arm: Emulator) -> None:
-    shell = [sys.executable, "-m", "hal.drivers.franka.emulator.control", "--host", arm.host]
+    shell = [sys.executable, "-m", "hal_emulators.franka.control", "--host", arm.host]
     done = subprocess.run([*shell, "user-stop", "on"], capture_output=True, text=True, timeout=20)
     assert (done.returncode, done.stdout) == (0, "{}\n")
     assert arm.control.send("state")["mode"] == "user_stopped"

@@ -146,7 +146,7 @@ def test_a_robot_that_does_not_answer_is_an_error(robot: str) -> None:
     host = free_host()
     error = opening_error(host, robot)
     assert (type(error), error.code) == (hal.ConnectionLost, "refused")
-    assert f"python -m hal.drivers.franka.emulator --host {host}" in str(error)
+    assert f"hal emulate franka --host {host}" in str(error)
 
 
 def test_an_unknown_host_name_is_named() -> None:

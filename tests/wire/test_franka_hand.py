@@ -312,7 +312,7 @@ def test_the_client_library_ends_with_its_driver(bench):
 
 def test_the_emulated_hand_is_a_program_too():
     host = free_host()
-    program = [sys.executable, "-m", "hal.drivers.franka.emulator.hand", "--host", host, "--object", "0.03"]
+    program = [sys.executable, "-m", "hal_emulators.franka.hand", "--host", host, "--object", "0.03"]
     with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert host in process.stdout.readline()
         process.stdin.write("state\nstop-ignored perhaps\n")

@@ -16,10 +16,10 @@ import pytest
 from hal.commands import CommandRecord, Inbox, Kind, Session
 from hal.config import load
 from hal.driver import Reading, Setpoint
-from hal.drivers.franka.emulator.motion import LimitChecker, MotionSample, at_rest, by_position, extrapolated
 from hal.drivers.franka.limits import LIMITS
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec
+from hal_emulators.franka.motion import LimitChecker, MotionSample, at_rest, by_position, extrapolated
 
 pytestmark = pytest.mark.slow
 

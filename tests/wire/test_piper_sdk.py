@@ -37,7 +37,7 @@ def test_the_vendors_sdk_drives_the_emulator_and_notices_its_end() -> None:
     port = BusSettings(**bus).arguments()["port"]
     environment = os.environ | {"CAN_CONFIG": json.dumps({"port": port, "hop_limit": 0})}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    emulator = subprocess.Popen([sys.executable, "-m", "hal.drivers.can.emulator", *rig], **pipes)  # type: ignore[call-overload]
+    emulator = subprocess.Popen([sys.executable, "-m", "hal_emulators.can", *rig], **pipes)  # type: ignore[call-overload]
     client: subprocess.Popen[str] | None = None
     try:
         line_of(emulator, "ready")

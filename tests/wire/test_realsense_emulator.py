@@ -18,15 +18,15 @@ import pytest
 
 rs = pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install 'robot-hal[realsense]'")
 
-from hal.drivers.realsense.emulator import (  # noqa: E402
+from hal.errors import CommandError  # noqa: E402
+from hal.specs import SensorSpec  # noqa: E402
+from hal_emulators.realsense import (  # noqa: E402
     Emulation,
     SoftwareCamera,
     emulated_context,
     read_number,
     write_recording,
 )
-from hal.errors import CommandError  # noqa: E402
-from hal.specs import SensorSpec  # noqa: E402
 
 from .realsense_client import VGA, Bench, Client, Picture, listed, played  # noqa: E402
 
@@ -474,7 +474,7 @@ def test_a_program_may_end_while_it_streams(end: str) -> None:
     done = run(
         f"""
         import pyrealsense2 as rs
-        from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
+        from hal_emulators.realsense import SoftwareCamera, emulated_context
         from hal.testing import camera_spec
         context = emulated_context()
         context.set_devices_changed_callback(lambda change: None)
@@ -495,7 +495,7 @@ def test_without_the_library_the_error_names_its_package() -> None:
         """
         import sys
         sys.modules["pyrealsense2"] = None
-        from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
+        from hal_emulators.realsense import SoftwareCamera, emulated_context
         from hal.errors import DriverMissing
         from hal.testing import camera_spec
         for call in (emulated_context, lambda: SoftwareCamera(camera_spec())):

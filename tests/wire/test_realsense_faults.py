@@ -29,7 +29,7 @@ from .realsense_bench import (
 )
 
 from hal.drivers.realsense.device import RealSenseDevice, find_camera, lock_camera  # isort: skip  # needs the library
-from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context  # isort: skip
+from hal_emulators.realsense import SoftwareCamera, emulated_context  # isort: skip
 from hal.drivers.realsense.options import apply_options, find_sensors  # isort: skip
 from hal.host.ring import FrameRing  # isort: skip
 

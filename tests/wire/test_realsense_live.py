@@ -14,7 +14,7 @@ from hal.specs import CameraSpec
 
 from .realsense_bench import PATIENCE, opened, read_again, read_until_lost, sent, software
 
-from hal.drivers.realsense.emulator import SoftwareCamera, read_number  # isort: skip  # needs the library
+from hal_emulators.realsense import SoftwareCamera, read_number  # isort: skip  # needs the library
 
 COLOR_FORMATS = ("rgb8", "bgr8", "rgba8", "bgra8", "yuyv", "uyvy")
 

@@ -13,7 +13,7 @@ from hal.errors import ConnectionLost, ControlTaken, NotSupported
 
 from .realsense_bench import PATIENCE, open_error, opened, read_again, read_until_lost, recording, sent, software, spec
 
-from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
+from hal_emulators.realsense import read_number  # isort: skip  # needs the library
 
 FRAMES = 45
 

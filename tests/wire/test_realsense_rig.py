@@ -23,7 +23,7 @@ from .realsense_bench import (
     spec,
 )
 
-from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
+from hal_emulators.realsense import read_number  # isort: skip  # needs the library
 from hal.drivers.realsense.options import RealSenseSettings  # isort: skip
 from hal.drivers.realsense.preflight import preflight  # isort: skip
 

@@ -15,12 +15,12 @@ from specs import cube, data, panda, world_spec
 from hal.config import load
 from hal.config.data_files import find_data
 from hal.drivers.franka.arm import FrankaArm
-from hal.drivers.franka.emulator.plant import RigidBody
 from hal.drivers.franka.limits import FR3, LIMITS
 from hal.drivers.franka.settings import check_arm
 from hal.dynamics import Dynamics
 from hal.kinematics.arm import Kinematics
 from hal.specs import RobotSpec
+from hal_emulators.franka.plant import RigidBody
 
 URDF = find_data("robots", "fr3.urdf")
 PANDA = find_data("robots", "panda.urdf")

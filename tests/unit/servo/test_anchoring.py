@@ -17,12 +17,12 @@ from specs import panda
 
 from hal.commands import Kind
 from hal.driver import Reading
-from hal.drivers.franka.emulator.motion import at_rest, by_position, extrapolated
 from hal.errors import Fault
 from hal.kinematics.arm import Kinematics
 from hal.servo.anchoring import LATEST
 from hal.servo.audit import SetpointAudit
 from hal.types import Limited, RobotStatus
+from hal_emulators.franka.motion import at_rest, by_position, extrapolated
 
 
 class Device:

@@ -23,7 +23,6 @@ from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
 from hal.drivers.can.damiao_motor import ChainMotor, register_problems
 from hal.drivers.can.damiao_protocol import MotorRegister, MotorStatus
-from hal.drivers.can.emulator.server import CanEmulator
 from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
 from hal.drivers.can.piper_protocol import GripperRequest, JointTargets, decode_command
@@ -31,6 +30,7 @@ from hal.drivers.can.settings import BusSettings, DamiaoMotorSettings
 from hal.errors import ConfigError, ConnectionLost, ControlTaken, RobotFault
 from hal.host.cycle import ArmUnit
 from hal.types import RobotStatus
+from hal_emulators.can.server import CanEmulator
 
 from ....kits.can_kit import can_overrides
 
@@ -393,7 +393,7 @@ def test_a_stop_of_a_pipers_fingers_that_lag_behind_their_target(
     piper: Bench, monkeypatch: pytest.MonkeyPatch, block: float | None
 ) -> None:
     """Fingers slower than the command stop where they are; those that an object blocks press on with the same force."""
-    monkeypatch.setattr("hal.drivers.can.emulator.piper._FINGER_SPEED", 0.02)
+    monkeypatch.setattr("hal_emulators.can.piper._FINGER_SPEED", 0.02)
     piper.arm.gripper_width = 0.07
     piper.arm.restart()
     if block is not None:

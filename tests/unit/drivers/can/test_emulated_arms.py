@@ -19,11 +19,6 @@ from hal.drivers.can.damiao_protocol import (
     encode_register_write,
     encode_state_request,
 )
-from hal.drivers.can.emulator import piper as emulated_piper
-from hal.drivers.can.emulator.console import COMMANDS, execute
-from hal.drivers.can.emulator.damiao import EmulatedDamiaoArm
-from hal.drivers.can.emulator.piper import EmulatedPiperArm
-from hal.drivers.can.emulator.server import CanEmulator
 from hal.drivers.can.piper_protocol import (
     ENABLED,
     EnableRequest,
@@ -38,6 +33,11 @@ from hal.drivers.can.piper_protocol import (
     encode_joint_targets,
     find_firmware,
 )
+from hal_emulators.can import piper as emulated_piper
+from hal_emulators.can.console import COMMANDS, execute
+from hal_emulators.can.damiao import EmulatedDamiaoArm
+from hal_emulators.can.piper import EmulatedPiperArm
+from hal_emulators.can.server import CanEmulator
 
 DT = 1e-3
 

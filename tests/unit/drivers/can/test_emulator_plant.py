@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 
 from hal.config.loader import load
-from hal.drivers.can.emulator.damiao import shorted_damping
-from hal.drivers.can.emulator.plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
+from hal_emulators.can.damiao import shorted_damping
+from hal_emulators.can.plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
 
 KINEMATICS = load("yam", overrides=["cameras={}"]).resolve().robots[0].kinematics
 HOME = (0.0, 1.5, 1.35, -1.42, 0.0, 0.0)

@@ -15,10 +15,10 @@ from torque_kit import NOTHING, N, one, simulated
 
 from hal.config import load
 from hal.driver import RobotDriver, Setpoint
-from hal.drivers.franka.emulator.plant import RigidBody
 from hal.dynamics import Dynamics
 from hal.specs import BodySpec
 from hal.types import Limited, RobotStatus, Trip
+from hal_emulators.franka.plant import RigidBody
 
 STIFFNESS = np.array([0.0, 200.0, 200.0, 200.0, 20.0, 20.0, 2.0])  # Nm per rad, of an arm that keeps its posture
 RATES = pytest.mark.parametrize("rate_hz", [240.0, 1000.0])

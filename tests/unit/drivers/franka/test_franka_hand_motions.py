@@ -12,8 +12,6 @@ import pytest
 from hal import registry
 from hal.drivers.franka import hand_motions
 from hal.drivers.franka.arm import create_link
-from hal.drivers.franka.emulator.hand_fingers import FingerMotion, FingerMotionKind, Fingers
-from hal.drivers.franka.emulator.hand_network import HandStatus
 from hal.drivers.franka.hand_motions import (
     CallAnswer,
     GripperCall,
@@ -25,6 +23,8 @@ from hal.drivers.franka.hand_motions import (
 )
 from hal.errors import DriverMissing, Fault
 from hal.types import GripperOutcome
+from hal_emulators.franka.hand_fingers import FingerMotion, FingerMotionKind, Fingers
+from hal_emulators.franka.hand_network import HandStatus
 
 DT = 0.01
 ABORTED = Fault("hand_aborted", "it was stopped", "")

@@ -6,8 +6,8 @@ import struct
 
 import pytest
 
-from hal.drivers.franka.emulator.hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
-from hal.drivers.franka.emulator.hand_network import (
+from hal_emulators.franka.hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
+from hal_emulators.franka.hand_network import (
     HandCode,
     HandRequest,
     HandRequestParser,

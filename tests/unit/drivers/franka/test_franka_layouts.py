@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from hal.drivers.franka.emulator.protocol import COMMAND, PROTOCOLS, STATE, RequestOutcome, StatePacket, read_command
+from hal_emulators.franka.protocol import COMMAND, PROTOCOLS, STATE, RequestOutcome, StatePacket, read_command
 
 
 def test_sizes_are_those_that_clients_accept() -> None:

@@ -7,7 +7,9 @@ from math import cos, pi, sqrt
 
 import pytest
 
-from hal.drivers.franka.emulator.motion import (
+from hal.drivers.franka.flags import FLAGS
+from hal.drivers.franka.limits import LIMITS, ArmLimits
+from hal_emulators.franka.motion import (
     DT,
     LimitChecker,
     MotionSample,
@@ -19,8 +21,6 @@ from hal.drivers.franka.emulator.motion import (
     by_velocity,
     extrapolated,
 )
-from hal.drivers.franka.flags import FLAGS
-from hal.drivers.franka.limits import LIMITS, ArmLimits
 
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 FR3, FER = LIMITS["fr3"], LIMITS["fer"]

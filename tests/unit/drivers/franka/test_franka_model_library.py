@@ -12,8 +12,8 @@ import pinocchio as pin
 import pytest
 
 from hal.config.data_files import find_data
-from hal.drivers.franka.emulator.model_library import write_model_library
-from hal.drivers.franka.emulator.plant import arm_only
+from hal_emulators.franka.model_library import write_model_library
+from hal_emulators.franka.plant import arm_only
 
 pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="needs an x86-64 processor")
 

@@ -45,7 +45,7 @@ def checked(spec: RobotSpec) -> dict[str, CheckResult]:
 def test_a_refused_port_ends_the_check_with_the_way_to_start_the_emulator_or_fci() -> None:
     found = checked(rig())
     assert (list(found), found["robot"].level) == (["route", "robot"], "fail")
-    assert f"emulator --host {EMPTY}" in found["robot"].remedy
+    assert f"hal emulate franka --host {EMPTY}" in found["robot"].remedy
     assert "FCI" in checked(replace(rig(), emulated=False))["robot"].remedy
 
 

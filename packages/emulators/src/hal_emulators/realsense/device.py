@@ -185,7 +185,8 @@ class EmulatedDevice:
 
     def clear_serial(self) -> None:
         """Remove the serial number: the library lists an unplugged camera while it is referenced, but it can then not
-        be opened by its number."""
+        be opened by its number.
+        """
         self._set_info(self._rs.camera_info.serial_number, "")
 
 

@@ -200,7 +200,8 @@ def write_recording(
 
 def _record(path: Path, spec: CameraSpec, numbers: list[int], metadata: bool, images: EmulatedImages) -> None:
     """Record frames. The library writes in a thread of its own, and finishes when the last reference to recorder and
-    sensors goes: at the end of this function."""
+    sensors goes: at the end of this function.
+    """
     rs = load_realsense()
     device = EmulatedDevice(
         make_streams(spec),

@@ -11,9 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from hal.specs import RobotSpec
-
-from ..damiao_protocol import (
+from hal.drivers.can.damiao_protocol import (
     CLEAR_ERROR,
     DISABLE,
     ENABLE,
@@ -32,7 +30,9 @@ from ..damiao_protocol import (
     decode_register_request,
     encode_register_reply,
 )
-from ..settings import DamiaoArmSettings, DamiaoGripperSettings, DamiaoMotorSettings
+from hal.drivers.can.settings import DamiaoArmSettings, DamiaoGripperSettings, DamiaoMotorSettings
+from hal.specs import RobotSpec
+
 from .plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
 
 __all__ = ["EmulatedDamiaoArm", "DamiaoMotor", "shorted_damping"]

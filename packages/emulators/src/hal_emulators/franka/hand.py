@@ -1,7 +1,7 @@
 """Emulated Franka Hand: Franka's own client library talks to it as to the hand.
 
 It answers on TCP 1338 and sends states by UDP, from a thread of its own that sleeps nearly all of the time, so it can
-run beside the arm's loop. On its own: ``python -m hal.drivers.franka.emulator.hand --host 127.0.0.2``.
+run beside the arm's loop. On its own: ``python -m hal_emulators.franka.hand --host 127.0.0.2``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The emulator as a program: ``python -m hal.drivers.franka.emulator --help``."""
+"""The emulator as a program: ``hal emulate franka --help``."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m hal.drivers.franka.emulator",
+        prog="hal emulate franka",
         description="Emulates a Franka arm and its hand for the vendor's own client libraries. Limits and timing are "
         "checked as documented; what is not documented is assumed. It proves nothing about a real arm.",
         epilog="commands, typed here or sent to the control port:\n" + help_text(),

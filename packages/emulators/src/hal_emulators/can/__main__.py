@@ -1,4 +1,4 @@
-"""The emulator as a program: ``python -m hal.drivers.can.emulator --config yam_emulator``."""
+"""The emulator as a program: ``hal emulate can --config yam_emulator``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _locks: list[DeviceLock] = []
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m hal.drivers.can.emulator",
+        prog="hal emulate can",
         description="Emulates every arm on a CAN bus in a rig: Damiao motors or a PiPER, with mass, gravity and "
         "friction. What the manuals leave open is assumed; it proves nothing about a real arm.",
         epilog="commands, typed here or sent to the control port; with several arms, the arm's name first:\n"

@@ -20,9 +20,9 @@ from typing import Any, Protocol
 import can
 
 from hal.config.loader import load
+from hal.drivers.can.settings import BusSettings
 from hal.specs import RobotSpec
 
-from ..settings import BusSettings
 from .damiao import EmulatedDamiaoArm
 from .piper import EmulatedPiperArm
 from .plant import ArmPlant

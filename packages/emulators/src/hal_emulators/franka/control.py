@@ -1,6 +1,6 @@
 """Client of a running emulator's control port, for shells and tests.
 
-python -m hal.drivers.franka.emulator.control --host 127.0.0.2 reflex joint_reflex
+python -m hal_emulators.franka.control --host 127.0.0.2 reflex joint_reflex
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class EmulatorControl:
 def main(arguments: list[str] | None = None) -> int:
     """Run the program, and return its exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m hal.drivers.franka.emulator.control",
+        prog="python -m hal_emulators.franka.control",
         description="Send one command to a running emulator, and print its answer as JSON.",
         epilog="commands:\n" + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -10,9 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from hal.specs import RobotSpec
-
-from ..piper_protocol import (
+from hal.drivers.can.piper_protocol import (
     ALL_JOINTS,
     ARM_STATUS,
     CAN_CONTROL,
@@ -44,7 +42,9 @@ from ..piper_protocol import (
     encode_pose,
     firmware_pieces,
 )
-from ..settings import PiperArmSettings
+from hal.drivers.can.settings import PiperArmSettings
+from hal.specs import RobotSpec
+
 from .plant import OFF, ArmPlant, Drive, JointMechanics
 
 __all__ = ["EmulatedPiperArm"]
