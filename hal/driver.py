@@ -557,6 +557,8 @@ class GamepadDriver(DeviceDriver):
         """Messages for the user about this pad, each with the remedy."""
         self.flat: Mapping[str, float] = MappingProxyType({})
         """Axis -> share of its travel (0..1) that the pad itself calls neutral."""
+        self.absolute: Collection[str] = ()
+        """Axes that stay where they are put (a lever), and need not be at rest before the pad counts."""
 
     @classmethod
     def plugged(cls) -> Plugged:

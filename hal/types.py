@@ -28,6 +28,7 @@ __all__ = [
     "GripperOutcome",
     "GripperState",
     "Limited",
+    "ONE_SIDED",
     "PadState",
     "Pose",
     "RobotState",
@@ -41,15 +42,19 @@ __all__ = [
 Array = NDArray[np.float64]
 
 STICK_AXES = ("left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y")
-"""Axes of a gamepad with sticks. Sticks and d-pad in -1..1, right and up positive; triggers in 0..1."""
+"""Axes of a gamepad with sticks, in the order in which the console's page sends them. Right and up are positive."""
 
 CAP_AXES = ("push_x", "push_y", "push_z", "turn_x", "turn_y", "turn_z")
-"""Axes of a pad with one cap that moves in all directions (a SpaceMouse), -1..1: pushed forward, left and up, and
+"""Axes of a pad with one cap that moves in all directions (a SpaceMouse): pushed forward, left and up, and
 rotated about these directions, right-handed. They match the axes of an arm's base frame for a user who stands behind
 it."""
 
 AXES = STICK_AXES + CAP_AXES
-"""All axes that a pad may have."""
+"""All axes that a pad may have. Values are in -1..1, those of :data:`ONE_SIDED` in 0..1. A pad has some of them, and
+datasets find theirs by name."""
+
+ONE_SIDED = ("l2", "r2")
+"""Axes in 0..1: triggers, levers. One that is a name of :data:`BUTTONS` as well is also a button."""
 
 BUTTONS = ("south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", "home", "touchpad")
 """Buttons of a pad, named by position: ``south`` is Cross on a Sony pad and A on an Xbox pad."""
