@@ -27,6 +27,7 @@ __all__ = [
     "Frame",
     "GripperOutcome",
     "GripperState",
+    "ImageStream",
     "Limited",
     "ONE_SIDED",
     "PadState",
@@ -60,17 +61,37 @@ BUTTONS = ("south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "
 """Buttons of a pad, named by position: ``south`` is Cross on a Sony pad and A on an Xbox pad."""
 
 
-STREAMS: Mapping[str, tuple[DTypeLike, tuple[int, ...]]] = MappingProxyType(
-    {
-        "color": (np.uint8, (3,)),
-        "depth": (np.float32, ()),
-        "infrared": (np.uint8, ()),
-        "infrared_right": (np.uint8, ()),
-        "segmentation": (np.int32, ()),
-    }
+@dataclass(frozen=True, slots=True)
+class ImageStream:
+    """A kind of images that cameras make: a field of :class:`Frame` and of :class:`hal.driver.RawFrame`."""
+
+    name: str
+    dtype: DTypeLike = np.uint8
+    shape: tuple[int, ...] = ()
+    """Shape of an image after height and width."""
+    lowest: float = 0
+    highest: float | None = 255
+    """Range of the values; None for the camera's range of depth."""
+    exact: bool = False
+    """Whether a value is a measurement or a name, not a brightness: it is never averaged, and recorded without loss
+    instead of in a video. Depth is stored in a unit of length, any other exact stream as 16-bit whole numbers."""
+    like: str | None = None
+    """Stream of the same sensor, whose values in the camera's model are the defaults of this one's."""
+    unaligned: bool = False
+    """Whether its images keep their own sensor's view (``CameraInfo.K_infrared``), instead of that of the frame."""
+    rendered: bool = False
+    """Whether only simulated cameras have it, without options."""
+
+
+_KINDS = (
+    ImageStream("color", shape=(3,)),
+    ImageStream("depth", np.float32, highest=None, exact=True),
+    ImageStream("infrared", like="depth", unaligned=True),
+    ImageStream("infrared_right", like="infrared", unaligned=True),
+    ImageStream("segmentation", np.int32, lowest=-1, highest=2**31 - 1, exact=True, rendered=True),
 )
-"""Every stream that a camera may have: the type of its images, and their shape after height and width. Each is a field
-of :class:`Frame`."""
+STREAMS: Mapping[str, ImageStream] = MappingProxyType({kind.name: kind for kind in _KINDS})
+"""Every stream that a camera may have, by its name."""
 
 
 @dataclass(frozen=True, slots=True)
