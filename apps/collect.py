@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hal.apps._common import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
+from hal.types import STREAMS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -57,8 +58,7 @@ def parser() -> argparse.ArgumentParser:
         "--streams",
         default="color,depth",
         metavar="NAMES",
-        help="streams to record: color, depth, infrared, infrared_right, segmentation; objects: their poses as an "
-        "observation (%(default)s)",
+        help=f"streams to record: {', '.join(STREAMS)}; objects: their poses as an observation (%(default)s)",
     )
     what.add_argument("--no-depth", dest="depth", action="store_false", help="do not record depth")
     what.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hal.apps._common import add_config_options, add_episode_options, config_options, run_app
+from hal.types import STREAMS
 
 if TYPE_CHECKING:
     from hal.apps._display import StatusLine
@@ -71,8 +72,7 @@ def parser() -> argparse.ArgumentParser:
         "--streams",
         default="color,depth",
         metavar="NAMES",
-        help="streams to record: color, depth, infrared, infrared_right, segmentation; objects: their poses as an "
-        "observation (%(default)s)",
+        help=f"streams to record: {', '.join(STREAMS)}; objects: their poses as an observation (%(default)s)",
     )
     run.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")
     where = made.add_argument_group("workers")

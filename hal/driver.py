@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from .errors import Fault, NotSupported
 from .geometry import Pose, freeze
-from .types import GripperOutcome
+from .types import STREAMS, GripperOutcome
 
 if TYPE_CHECKING:
     from .specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
@@ -481,7 +481,7 @@ class CameraDriver(DeviceDriver):
         for name, s in spec.sensors.items():
             pose = Pose(s.position, s.orientation)
             streams[name] = StreamInfo(s.format, s.width, s.height, s.rate_hz, freeze(s.K), distortion, pose)
-        infrared = spec.K_infrared or (spec.K if {"infrared", "infrared_right"} & set(spec.streams) else None)
+        infrared = spec.K_infrared or (spec.K if any(STREAMS[name].unaligned for name in spec.streams) else None)
         K_infrared = None if infrared is None else freeze(infrared)
         clock = "simulated" if self.simulated else "hardware"
         made = MappingProxyType(streams)
@@ -557,6 +557,8 @@ class GamepadDriver(DeviceDriver):
         """Messages for the user about this pad, each with the remedy."""
         self.flat: Mapping[str, float] = MappingProxyType({})
         """Axis -> share of its travel (0..1) that the pad itself calls neutral."""
+        self.absolute: Collection[str] = ()
+        """Axes that stay where they are put (a lever), and need not be at rest before the pad counts."""
 
     @classmethod
     def plugged(cls) -> Plugged:

@@ -235,12 +235,13 @@ class Gamepad:
         with self._lock:
             self._reading = reading
             if reading.connected:
-                buttons = self._gate.update(reading.axes, reading.buttons, reading.unknown)
+                buttons = self._gate.update(reading.axes, reading.buttons, reading.unknown, self.driver.absolute)
             else:
                 self._gate.shut()
                 buttons = frozenset()
             live = reading.connected and self._gate.open
-            axes = {name: self._shape_axis(name, reading.axes.get(name, 0.0)) if live else 0.0 for name in AXES}
+            values = {} if not live else {k: v for k, v in reading.axes.items() if k not in self._gate.ignored}
+            axes = {name: self._shape_axis(name, values.get(name, 0.0)) for name in AXES}
             for held in self._held.values():
                 held.update(reading, gate_open=live)
             last = self._state
@@ -282,7 +283,8 @@ class NeutralGate:
     """Blocks a pad's controls until they were all released.
 
     It opens when every axis is near neutral at the same time, triggers included, and closes when the pad disconnects. A
-    button that was pressed when it opened counts only after it was seen released.
+    button that was pressed when it opened counts only after it was seen released. An absolute axis, which stays where
+    it is put, does not keep it closed, and counts only after it was near neutral once.
 
     Args:
         near: Share of an axis' travel that counts as neutral; more than the drift of a worn stick.
@@ -292,28 +294,42 @@ class NeutralGate:
         self.near = near
         self.open = False
         self._seen_up: frozenset[str] = frozenset()
+        self._seen_neutral: frozenset[str] = frozenset()
+        self.ignored: frozenset[str] = frozenset()
+        """Absolute axes that do not count yet."""
         self.waiting_for: tuple[str, ...] = ()
         """Controls that must be released, or moved once if the pad has not reported them yet; for messages."""
 
     def shut(self) -> None:
         """Close the gate, because the pad has disconnected."""
         self.open = False
-        self._seen_up = frozenset()
+        self._seen_up = self._seen_neutral = frozenset()
         self.waiting_for = ()
 
-    def update(self, axes: Mapping[str, float], buttons: frozenset[str], unknown: Collection[str]) -> frozenset[str]:
+    def update(
+        self,
+        axes: Mapping[str, float],
+        buttons: frozenset[str],
+        unknown: Collection[str],
+        absolute: Collection[str] = (),
+    ) -> frozenset[str]:
         """Take a state of the connected pad.
 
         Args:
             axes: Axis -> value.
             buttons: Buttons that are pressed.
             unknown: Axes that the pad has not reported yet.
+            absolute: Axes that do not spring back.
 
         Returns:
-            The buttons that count.
+            The buttons that count; :attr:`ignored` has the axes that do not.
         """
+        if absolute:
+            self._seen_neutral |= {x for x in absolute if x not in unknown and abs(axes.get(x, 1.0)) <= self.near}
+            self.ignored = frozenset(absolute) - self._seen_neutral
         if not self.open:
-            away = tuple(name for name in AXES if name in unknown or not abs(axes.get(name, 0.0)) <= self.near)
+            held = (name for name in AXES if name not in absolute)
+            away = tuple(name for name in held if name in unknown or not abs(axes.get(name, 0.0)) <= self.near)
             self.open = not away
             unreported = bool(axes) and all(name in unknown for name in axes)
             self.waiting_for = ("any control: the pad has sent nothing yet",) if unreported else away
@@ -337,7 +353,7 @@ class HeldControl:
         if not gate_open:
             self._threshold.held = False
             pressed = True  # not a release, which would arm the switch
-        elif self.control in ("l2", "r2") and self.control in reading.axes:
+        elif self.control in reading.axes:  # a trigger
             pressed = self._threshold.update(reading.axes[self.control])
         else:
             pressed = self.control in reading.buttons

@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
+from .types import STREAMS
+
 __all__ = [
     "BodySpec",
     "BoxSpec",
@@ -341,7 +343,7 @@ class CameraSpec:
     """Nearest and farthest depth that the camera measures, m; outside it reports 0."""
     depth_max: float
     streams: tuple[str, ...]
-    """Some of ``color``, ``depth``, ``infrared`` (the left one of two), ``infrared_right``, ``segmentation``."""
+    """Some of :data:`hal.types.STREAMS`; ``infrared`` is the left one of two."""
     view: ViewSpec | None
     """Pose of the colour sensor's optical frame; None if it is unknown."""
     options: dict[str, Any] = field(default_factory=dict)
@@ -358,9 +360,10 @@ class CameraSpec:
     @property
     def reference(self) -> str:
         """The stream whose view the frames have: ``K`` and ``T_world_camera`` are those of its sensor."""
-        if self.align == "depth" or {"color", "depth", "segmentation"} & set(self.streams):
+        unaligned = [name for name, kind in STREAMS.items() if kind.unaligned and name in self.streams]
+        if self.align == "depth" or len(unaligned) < len(self.streams):
             return self.align
-        return next((name for name in ("infrared", "infrared_right") if name in self.streams), "color")
+        return unaligned[0] if unaligned else "color"
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,9 @@ __all__ = [
     "Frame",
     "GripperOutcome",
     "GripperState",
+    "ImageStream",
     "Limited",
+    "ONE_SIDED",
     "PadState",
     "Pose",
     "RobotState",
@@ -41,31 +43,55 @@ __all__ = [
 Array = NDArray[np.float64]
 
 STICK_AXES = ("left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y")
-"""Axes of a gamepad with sticks. Sticks and d-pad in -1..1, right and up positive; triggers in 0..1."""
+"""Axes of a gamepad with sticks, in the order in which the console's page sends them. Right and up are positive."""
 
 CAP_AXES = ("push_x", "push_y", "push_z", "turn_x", "turn_y", "turn_z")
-"""Axes of a pad with one cap that moves in all directions (a SpaceMouse), -1..1: pushed forward, left and up, and
+"""Axes of a pad with one cap that moves in all directions (a SpaceMouse): pushed forward, left and up, and
 rotated about these directions, right-handed. They match the axes of an arm's base frame for a user who stands behind
 it."""
 
 AXES = STICK_AXES + CAP_AXES
-"""All axes that a pad may have."""
+"""All axes that a pad may have. Values are in -1..1, those of :data:`ONE_SIDED` in 0..1. A pad has some of them, and
+datasets find theirs by name."""
+
+ONE_SIDED = ("l2", "r2")
+"""Axes in 0..1: triggers, levers. One that is a name of :data:`BUTTONS` as well is also a button."""
 
 BUTTONS = ("south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", "home", "touchpad")
 """Buttons of a pad, named by position: ``south`` is Cross on a Sony pad and A on an Xbox pad."""
 
 
-STREAMS: Mapping[str, tuple[DTypeLike, tuple[int, ...]]] = MappingProxyType(
-    {
-        "color": (np.uint8, (3,)),
-        "depth": (np.float32, ()),
-        "infrared": (np.uint8, ()),
-        "infrared_right": (np.uint8, ()),
-        "segmentation": (np.int32, ()),
-    }
+@dataclass(frozen=True, slots=True)
+class ImageStream:
+    """A kind of images that cameras make: a field of :class:`Frame` and of :class:`hal.driver.RawFrame`."""
+
+    name: str
+    dtype: DTypeLike = np.uint8
+    shape: tuple[int, ...] = ()
+    """Shape of an image after height and width."""
+    lowest: float = 0
+    highest: float | None = 255
+    """Range of the values; None for the camera's range of depth."""
+    exact: bool = False
+    """Whether a value is a measurement or a name, not a brightness: it is never averaged, and recorded without loss
+    instead of in a video. Depth is stored in a unit of length, any other exact stream as 16-bit whole numbers."""
+    like: str | None = None
+    """Stream of the same sensor, whose values in the camera's model are the defaults of this one's."""
+    unaligned: bool = False
+    """Whether its images keep their own sensor's view (``CameraInfo.K_infrared``), instead of that of the frame."""
+    rendered: bool = False
+    """Whether only simulated cameras have it, without options."""
+
+
+_KINDS = (
+    ImageStream("color", shape=(3,)),
+    ImageStream("depth", np.float32, highest=None, exact=True),
+    ImageStream("infrared", like="depth", unaligned=True),
+    ImageStream("infrared_right", like="infrared", unaligned=True),
+    ImageStream("segmentation", np.int32, lowest=-1, highest=2**31 - 1, exact=True, rendered=True),
 )
-"""Every stream that a camera may have: the type of its images, and their shape after height and width. Each is a field
-of :class:`Frame`."""
+STREAMS: Mapping[str, ImageStream] = MappingProxyType({kind.name: kind for kind in _KINDS})
+"""Every stream that a camera may have, by its name."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -197,7 +197,7 @@ class EvdevPad(GamepadDriver):
         except OSError:  # unplugged again already
             node.close()
             return
-        self.flat = self._link.mapper.flat
+        self.flat, self.absolute = self._link.mapper.flat, self._link.mapper.model.absolute
 
     def _guessed(self, info: NodeInfo, node: InputNode) -> PadModel:
         model = guess_model(info.identity, node.axes, node.keys, node.rels)

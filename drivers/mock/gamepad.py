@@ -10,13 +10,13 @@ from typing import ClassVar
 from hal.driver import GamepadDriver, PadReading
 from hal.errors import CommandError
 from hal.specs import PadSpec
-from hal.types import AXES, BUTTONS
+from hal.types import AXES, BUTTONS, ONE_SIDED
 
 from .faults import MockPadFaults, with_faults
 
 __all__ = ["MockPad"]
 
-_TRIGGERS = ("l2", "r2")
+_TRIGGERS = tuple(name for name in BUTTONS if name in AXES)
 _TRIGGER_PRESSED = 0.1  # travel from which on a trigger, which is also a button, counts as pressed
 
 
@@ -163,6 +163,6 @@ def _check(axes: Mapping[str, float], buttons: Iterable[str]) -> None:
     for name, value in axes.items():
         if name not in AXES:
             raise CommandError(f"unknown axis {name!r}; axes: {', '.join(AXES)}", code="unknown_control")
-        lowest = 0.0 if name in _TRIGGERS else -1.0
+        lowest = 0.0 if name in ONE_SIDED else -1.0
         if not lowest <= value <= 1.0:
             raise CommandError(f"{name} is from {lowest:g} to 1, not {value!r}", code="out_of_range")

@@ -89,7 +89,7 @@ class PlaybackPad(GamepadDriver):
         """Read the recording. Raises ConfigError, which lists every bad line."""
         self._recording = load_recording(self._options.file)
         self._mapper = PadMapper(self._find_model(), self._recording.ranges)
-        self.flat = self._mapper.flat
+        self.flat, self.absolute = self._mapper.flat, self._mapper.model.absolute
         self._t0 = None
         self._next = self._round = 0
         self._behind = 0.0

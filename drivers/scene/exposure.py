@@ -121,13 +121,9 @@ class Exposure:
             t,
             t_device,
             number,
-            color=images.color,
-            depth=depth,
-            infrared=sides.get("infrared", images.infrared),
-            infrared_right=sides.get("infrared_right"),
-            segmentation=images.segmentation,
             T_world_camera=view,
             skew=0.0 if images.color is not None and depth is not None else None,
+            **{**images._asdict(), "depth": depth, **sides},
         )
 
 

@@ -26,7 +26,7 @@ from hal.host.process import Channel, Child, SharedMemory
 from hal.host.ring import frame_rings, frame_rings_size
 from hal.pads.keyboard import keyboard_table
 from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
-from hal.types import Frame
+from hal.types import STREAMS, Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
 
 from .messages import ALARMS
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["ProcessChannel", "WebConsole", "recording_message"]
 
 _TOKEN_BYTES = 18
-_STREAMS = ("color", "infrared", "depth")
+_STREAMS = (*(name for name, kind in STREAMS.items() if not kind.exact), "depth")
 """A page shows the first of these streams that a camera has."""
 _MAX_LINE = 300
 """Characters of a line; a page shows no more."""

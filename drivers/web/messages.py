@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
-from hal.types import BUTTONS, STICK_AXES
+from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
 from hal.views import ACTIONS, FRAMES, SETTINGS
 
 __all__ = [
@@ -52,8 +52,7 @@ _LEFT = {
 }
 _MIN_SPEED = 0.01
 """Smallest share of the mapping's speeds that a page may set."""
-_ONE_SIDED = ("l2", "r2")
-_RANGES = tuple((0.0 if axis in _ONE_SIDED else -1.0, 1.0) for axis in STICK_AXES)
+_RANGES = tuple((0.0 if axis in ONE_SIDED else -1.0, 1.0) for axis in STICK_AXES)
 _MASKS = 1 << len(BUTTONS)
 _MAX_TIME = 1e9
 """ms, and s: more than any clock here shows."""

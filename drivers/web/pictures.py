@@ -22,6 +22,7 @@ from hal.auth import Authenticator
 from hal.driver import RawFrame
 from hal.host.ring import FrameRing
 from hal.specs import CameraSpec
+from hal.types import STREAMS
 
 from .messages import MalformedMessage, PictureDrawn, WatchRequest, parse
 from .sockets import PageSocket, PageSockets
@@ -281,8 +282,9 @@ def compress(frame: RawFrame, spec: CameraSpec) -> bytes:
     if frame.color is not None:
         small = spec.width * spec.height <= _SMALL
         return _jpeg(smoothed(frame.color) if small else frame.color, "RGB", "420")
-    if frame.infrared is not None:
-        return _jpeg(frame.infrared[:, :, np.newaxis], "GRAY", "Gray")
+    grey = next((getattr(frame, name) for name in spec.streams if not STREAMS[name].exact), None)
+    if grey is not None:
+        return _jpeg(grey[:, :, np.newaxis], "GRAY", "Gray")
     if frame.depth is None:
         raise ValueError(f"camera {spec.name} has no stream that can be shown")
     return _jpeg(_grey(frame.depth, spec.depth_min, spec.depth_max)[:, :, np.newaxis], "GRAY", "Gray")

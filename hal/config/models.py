@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from ..types import STREAMS
 from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, read_yaml, suggest
 from .schema import (
@@ -306,7 +307,7 @@ def expand_names(value: Any) -> Any:
 class StreamModel(Strict):
     """One stream of a camera, where it differs from the model's common values.
 
-    ``infrared_right`` defaults to ``infrared``, which defaults to ``depth``.
+    Its defaults are the values of the stream that :attr:`hal.types.ImageStream.like` names.
     """
 
     modes: tuple[Mode, ...] | None = None
@@ -327,9 +328,11 @@ class DepthSensor(Strict):
     """m per unit of the raw image."""
 
 
-SensorStream = Literal["color", "depth", "infrared", "infrared_right"]
-"""Streams that a real camera may have; a simulated one may also have a segmentation."""
-_MADE_FROM = {"infrared_right": "infrared", "infrared": "depth"}
+if TYPE_CHECKING:
+    SensorStream = str
+else:
+    SensorStream = Literal[tuple(name for name, kind in STREAMS.items() if not kind.rendered)]
+"""Streams that a real camera may have; a simulated one may also have those that are only rendered."""
 
 
 def _make_streams() -> dict[SensorStream, StreamModel]:
@@ -399,10 +402,10 @@ class CameraModel(Strict):
     def _find_value(self, name: str, key: str) -> Any:
         place: str | None = name if name in self.streams else "color"
         while place is not None:
-            own = getattr(self.streams.get(place), key, None)  # type: ignore[call-overload]  # any name is allowed
+            own = getattr(self.streams.get(place), key, None)
             if own is not None:
                 return own
-            place = _MADE_FROM.get(place)
+            place = STREAMS[place].like
         return getattr(self, key, None)
 
 

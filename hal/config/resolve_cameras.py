@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from ..geometry import Pose
 from ..images import Intrinsics, centre_crop, from_field_of_view
 from ..specs import CameraSpec, DepthSensorSpec, SensorSpec, ViewSpec
+from ..types import STREAMS
 from .context import Context, check_camera_spec, merge_options
 from .files import suggest
 from .models import CameraModel, Capture
@@ -23,10 +24,8 @@ __all__ = [
     "resolve_streams",
 ]
 
-_ONE_SENSOR: tuple[Stream, ...] = ("depth", "infrared", "infrared_right")
+_ONE_SENSOR = ("depth", *(name for name, kind in STREAMS.items() if kind.like))
 """Streams that a depth camera computes from the same images: of one size, at one rate."""
-_RENDERED = "segmentation"
-"""The stream that only simulated cameras have."""
 
 
 def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraSpec | None:
@@ -64,7 +63,7 @@ def _make_spec(
     reference = streams.reference
     output = config.output or Output(width=reference.width, height=reference.height)
     sensor = model.depth_sensor
-    infrared = [streams.sensors[name] for name in ("infrared", "infrared_right") if name in streams.sensors]
+    infrared = [streams.sensors[name] for name, kind in STREAMS.items() if kind.unaligned and name in streams.sensors]
     return CameraSpec(
         name=name,
         model=config.model,
@@ -130,15 +129,16 @@ def _check_streams(context: Context, key: str, config: CameraConfig, model: Came
     if not config.streams:
         context.report(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}", "missing_key")
     simulated = context.is_simulated(config)
-    allowed = (*model.streams, "segmentation") if simulated else tuple(model.streams)
+    rendered = [name for name, kind in STREAMS.items() if kind.rendered]
+    allowed = (*model.streams, *rendered) if simulated else tuple(model.streams)
     for stream in config.streams:
-        if stream not in allowed and stream in get_args(Stream):  # others are already problems
-            hint = "; only simulated cameras have it" if stream == "segmentation" else ""
+        if stream not in allowed and stream in STREAMS:  # others are already problems
+            hint = "; only simulated cameras have it" if stream in rendered else ""
             message = f"model {config.model!r} has only {', '.join(allowed)}{hint}"
             context.report(f"{key}.streams.{stream}", message, "unknown_stream")
-    drawn = config.streams.get("segmentation")
-    if simulated and drawn is not None and drawn.model_fields_set:
-        context.report(f"{key}.streams.segmentation", "is rendered with the frame and has no options", "conflict")
+    for stream in rendered:
+        if simulated and stream in config.streams and config.streams[stream].model_fields_set:
+            context.report(f"{key}.streams.{stream}", "is rendered with the frame and has no options", "conflict")
 
 
 def _find_view(context: Context, config: CameraConfig) -> ViewSpec | None:
@@ -171,7 +171,7 @@ class Streams(NamedTuple):
 def resolve_streams(context: Context, key: str, config: CameraConfig, model: CameraModel) -> Streams | None:
     """Return the streams and the view of the frames; None, with the problems added, if there are any."""
     before = len(context.problems.found)
-    on = [name for name in config.streams if name != _RENDERED and name in model.streams]
+    on = [name for name in config.streams if name in model.streams]
     captures = _set_captures(on, config.streams, config.capture or model.capture)
     _check_modes(context, key, config, model, captures)
     _check_formats(context, key, config, model, on)
@@ -204,7 +204,7 @@ def _set_captures(
 ) -> dict[Stream, Capture]:
     """Return size and rate of each stream. Infrared has those of depth, unless the rig gives it its own."""
     found: dict[Stream, Capture] = {}
-    for name in sorted(on, key=[*_ONE_SENSOR, "color"].index):
+    for name in sorted(on, key=[*_ONE_SENSOR, *STREAMS].index):
         own = configs[name]
         alike = next((found[other] for other in _ONE_SENSOR if other in found and name in _ONE_SENSOR), default)
         width, height = (own.width, own.height) if own.width and own.height else (alike.width, alike.height)

@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..registry import explain_engine
 from ..specs import ViewSpec
-from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, SensorStream, expand_names
+from ..types import STREAMS
+from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, expand_names
 from .schema import (
     CameraRate,
     Coordinate,
@@ -288,7 +289,10 @@ class StreamConfig(Strict):
         return self
 
 
-Stream = Literal[SensorStream, "segmentation"]
+if TYPE_CHECKING:
+    Stream = str
+else:
+    Stream = Literal[tuple(STREAMS)]
 
 
 def _make_default_streams() -> dict[Stream, StreamConfig]:

@@ -240,7 +240,7 @@ def frame_rings_size(specs: Sequence[CameraSpec]) -> int:
 def _list_arrays(spec: CameraSpec) -> dict[str, tuple[tuple[int, ...], DTypeLike]]:
     """Return shape and type of the pictures of each stream of a camera."""
     return {
-        name: ((spec.height, spec.width, *more), dtype)
-        for name, (dtype, more) in STREAMS.items()
+        name: ((spec.height, spec.width, *kind.shape), kind.dtype)
+        for name, kind in STREAMS.items()
         if name in spec.streams
     }

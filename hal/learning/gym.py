@@ -31,6 +31,7 @@ from ..observation import Observation
 from ..rig import Rig, open_rig
 from ..robot import Robot
 from ..specs import CameraSpec
+from ..types import STREAMS
 from .episode import reset_scene, stands_in_world
 
 try:
@@ -167,13 +168,9 @@ def _picture_space(camera: CameraSpec, stream: str) -> spaces.Box:
     size = (camera.height, camera.width)
     if stream == POINTS:
         return spaces.Box(-np.inf, np.inf, (*size, 3), np.float32)
-    if stream == "color":
-        return spaces.Box(0, 255, (*size, 3), np.uint8)
-    if stream == "depth":
-        return spaces.Box(0.0, camera.depth_max, (*size, 1), np.float32)
-    if stream == "segmentation":
-        return spaces.Box(-1, np.iinfo(np.int32).max, (*size, 1), np.int32)
-    return spaces.Box(0, 255, (*size, 1), np.uint8)
+    kind = STREAMS[stream]
+    highest = camera.depth_max if kind.highest is None else kind.highest
+    return spaces.Box(kind.lowest, highest, (*size, *(kind.shape or (1,))), np.dtype(kind.dtype).type)
 
 
 def numbers_and_pictures(

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..deadman import Threshold
+from ..types import AXES, BUTTONS, ONE_SIDED
 from .codes import ABS, EV_ABS, EV_KEY, EV_REL, KEY, REL
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ REL_SILENCE = 0.1
 """Time without an event after which a ``REL_`` axis is at rest, s: no event is sent when it is released. A pushed cap
 reports at the rate of USB, every 8 or 16 ms, so late reports do not interrupt a motion. The time is shorter than the
 120 ms after which a silent pad stops the arm."""
-_TRIGGERS = ("l2", "r2")
 
 
 class AxisRange(NamedTuple):
@@ -28,11 +28,11 @@ class AxisRange(NamedTuple):
     flat: int = 0
     """Distance from the middle that counts as rest."""
 
-    def normalise(self, value: int, trigger: bool) -> float:
-        """Return a value from -1 to 1 for a stick, from 0 to 1 for a trigger."""
+    def normalise(self, value: int, one_sided: bool) -> float:
+        """Return a value from -1 to 1 for a stick, from 0 to 1 for a one-sided axis."""
         share = (value - self.minimum) / (self.maximum - self.minimum)
         share = min(1.0, max(0.0, share))
-        return share if trigger else 2.0 * share - 1.0
+        return share if one_sided else 2.0 * share - 1.0
 
 
 class _Axis(NamedTuple):
@@ -42,7 +42,9 @@ class _Axis(NamedTuple):
 
     def value(self, raw: int) -> float:
         """Return the canonical value."""
-        return self.sign * self.range.normalise(raw, self.control in _TRIGGERS) + 0.0  # no -0.0
+        one_sided = self.control in ONE_SIDED
+        share = self.range.normalise(raw, one_sided)
+        return 1.0 - share if one_sided and self.sign < 0.0 else self.sign * share + 0.0  # no -0.0
 
 
 class PadMapper:
@@ -77,8 +79,8 @@ class PadMapper:
         axes = (*self._axes.values(), *self._rels.values())
         reported = self._reported = frozenset(axis.control for axis in axes)
         pressed = set(self._keys.values())
-        self._computed_axes = tuple(name for name in _TRIGGERS if name in pressed - reported)
-        self._thresholds = {name: Threshold() for name in _TRIGGERS if name in reported - pressed}
+        self._computed_axes = tuple(name for name in AXES if name in pressed - reported)
+        self._thresholds = {name: Threshold() for name in BUTTONS if name in reported - pressed}
         directions = {control[1:] for control in pressed if control[0] in "+-"}
         self._controls = (*sorted(reported | directions), *self._computed_axes)
         self.flat: Mapping[str, float] = {
@@ -189,4 +191,4 @@ class PadMapper:
 
 def _measure_range(control: str) -> float:
     """Return the length of an axis' canonical range."""
-    return 1.0 if control in _TRIGGERS else 2.0
+    return 1.0 if control in ONE_SIDED else 2.0

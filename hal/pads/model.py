@@ -155,6 +155,8 @@ class PadModel(Strict):
     )
     """Event code -> (minimum, maximum): required for ``REL_`` axes, which report none, and for axes whose reported
     range is wrong."""
+    absolute: tuple[Annotated[str, _check_name("axis", [name for name in AXES if name not in BUTTONS])], ...] = ()
+    """Axes that stay where they are put, such as levers; none that is also a button, for a dead-man springs back."""
     motion_node: str | None = None
     """End of the name of the pad's motion sensor, which reports all the time and so shows that the pad is connected."""
     touch_node: str | None = None

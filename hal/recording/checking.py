@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CommandError, DatasetError
+from ..types import STREAMS
 from .about import read_about
 from .codecs import Stats, merge_stacked, merge_stats
 from .dataset import Dataset, Episode
@@ -21,7 +22,7 @@ from .foreign import is_foreign
 from .index import check_next_episode, read_entries, read_index, read_tasks, stats_parts, stray_files
 from .layout import (
     BOOKKEEPING,
-    SEGMENTATION,
+    MORE_STREAMS,
     STATE,
     VERSION,
     CameraSetup,
@@ -360,13 +361,15 @@ def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:
 
 
 def _depth(old: Mapping[str, Any], new: Sequence[CameraSetup]) -> Iterator[str]:
-    """Yield differences in depth or segmentation of the cameras in both, which no feature of the dataset shows."""
+    """Yield differences in depth or other exact streams of the cameras in both, which no feature shows."""
     for camera in new:
         if camera.name not in old:
             continue
-        kept = SEGMENTATION in old[camera.name].get("streams", ()), SEGMENTATION in camera.more
-        if kept[0] != kept[1]:
-            yield f"segmentation of {camera.name} is kept {'there, and not here' if kept[0] else 'here, and not there'}"
+        for stream in (name for name in MORE_STREAMS if STREAMS[name].exact):
+            kept = stream in old[camera.name].get("streams", ()), stream in camera.more
+            if kept[0] != kept[1]:
+                where = "there, and not here" if kept[0] else "here, and not there"
+                yield f"{stream} of {camera.name} is kept {where}"
         there, here = old[camera.name].get("depth_unit_m"), camera.depth_unit
         if there is None and here is not None:
             yield f"depth of {camera.name} is not kept there, and is here"

@@ -60,11 +60,15 @@ def to_units(depth: NDArray[np.float32], unit: float) -> Units:
     return units
 
 
-def ids_to_units(numbers: NDArray[np.int32]) -> Units:
-    """Return numbers of bodies (H, W), -1 for none, as units. Raises ValueError for a number above 65534."""
-    if numbers.size and not (numbers.min() >= -1 and numbers.max() < _MOST):
-        raise ValueError("a number of a body does not fit into 16 bits")
-    units: Units = (numbers + 1).astype("<u2")
+def ids_to_units(numbers: NDArray[Any], lowest: float = -1) -> Units:
+    """Return whole numbers (H, W) from ``lowest`` on as units from 0 on: those of bodies, -1 for none.
+
+    Raises ValueError for one that does not fit into 16 bits.
+    """
+    first = int(lowest)
+    if numbers.size and not (numbers.min() >= first and numbers.max() <= _MOST + first):
+        raise ValueError(f"a number is not in {first}..{_MOST + first}, and does not fit into 16 bits")
+    units: Units = (numbers.astype(np.int64) - first).astype("<u2")
     return units
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, DeviceNotFound
+from ..types import STREAMS
 from .about import read_about
 from .codecs import DepthReader
 from .foreign import is_foreign, read_foreign
@@ -24,7 +25,6 @@ from .index import read_index, repair_command
 from .layout import (
     GRIP_FORCE,
     MORE_STREAMS,
-    SEGMENTATION,
     SETPOINT,
     SUCCESS,
     TIMES,
@@ -308,8 +308,8 @@ class Episode:
 
         Args:
             camera: Name of the camera.
-            stream: ``color``, ``depth``, ``infrared``, ``infrared_right`` or ``segmentation``. Colour and infrared are
-                stored as video, so their values differ slightly from the camera's.
+            stream: A name of :data:`hal.types.STREAMS`. All but the exact ones are stored as video, so their values
+                differ slightly from the camera's.
 
         Raises:
             DeviceNotFound: That stream was not recorded.
@@ -318,14 +318,17 @@ class Episode:
         path = self._file_of(camera, stream)
         if path.suffix == ".mp4":
             height, width, _ = self._meta["features"][path.parent.parent.name]["shape"]
-            found = read_video(path, self.first_picture(path), self.fps)
-            if stream == "color":
-                return self._each(path, found, (height, width, 3))
-            return self._each(path, (picture[:, :, 0] for picture in found), (height, width))
+            pictures = read_video(path, self.first_picture(path), self.fps)
+            if STREAMS[stream].shape:
+                return self._each(path, pictures, (height, width, 3))
+            return self._each(path, (picture[:, :, 0] for picture in pictures), (height, width))
         reader = self._depth_reader(path)
         if stream == "depth":
             return self._each(path, iter(reader), reader.shape)
-        return self._each(path, (units.astype(np.int32) - 1 for units in reader.units()), reader.shape)
+        dtype, lowest = STREAMS[stream].dtype, int(STREAMS[stream].lowest)
+        return self._each(
+            path, ((units.astype(np.int32) + lowest).astype(dtype) for units in reader.units()), reader.shape
+        )
 
     def frame(self, camera: str, row: int) -> NDArray[np.uint8]:
         """Return the colour picture (H, W, 3) RGB of one row; at most one other one is decoded.
@@ -370,8 +373,9 @@ class Episode:
         }
         if known.get("depth_unit_m") is not None:
             found["depth"] = self._layout.depth(camera, self.number)
-        if SEGMENTATION in known.get("streams", ()):
-            found[SEGMENTATION] = self._layout.depth(f"{camera}_{SEGMENTATION}", self.number)
+        for stream in known.get("streams", ()):
+            if stream in MORE_STREAMS and STREAMS[stream].exact:
+                found[stream] = self._layout.depth(f"{camera}_{stream}", self.number)
         return found
 
     def first_picture(self, video: Path) -> int:

@@ -36,7 +36,6 @@ __all__ = [
     "MORE_STREAMS",
     "OBJECTS",
     "PAD",
-    "SEGMENTATION",
     "SETPOINT",
     "SOURCE",
     "SOURCES",
@@ -87,7 +86,6 @@ TIMES = "rig.time."
 the episode's first row."""
 GRID = f"{TIMES}grid"
 
-SEGMENTATION = "segmentation"
 MORE_STREAMS = tuple(stream for stream in STREAMS if stream not in ("color", "depth"))
 """Streams of a camera that are recorded only on request."""
 OBJECTS = "objects"
@@ -136,13 +134,13 @@ class CameraSetup(NamedTuple):
     def videos(self) -> dict[str, str]:
         """Names of the videos, each with its stream: ``wrist`` has the colour, ``wrist_infrared`` the infrared."""
         color = {self.name: "color"} if self.color else {}
-        return color | {f"{self.name}_{stream}": stream for stream in self.more if stream != SEGMENTATION}
+        return color | {f"{self.name}_{stream}": stream for stream in self.more if not STREAMS[stream].exact}
 
     @property
     def depths(self) -> dict[str, str]:
-        """Names of the files of lossless pictures, each with its stream: depth, segmentation."""
+        """Names of the files of lossless pictures, each with its stream: depth, and others that are exact."""
         depth = {self.name: "depth"} if self.depth_unit is not None else {}
-        return depth | {f"{self.name}_{stream}": stream for stream in self.more if stream == SEGMENTATION}
+        return depth | {f"{self.name}_{stream}": stream for stream in self.more if STREAMS[stream].exact}
 
 
 _RENAMED = re.compile(

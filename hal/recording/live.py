@@ -25,7 +25,7 @@ from ..host.memory import Mailbox
 from ..host.ring import ArrayRing, Images
 from ..types import STREAMS
 from .codecs import DepthFile, DepthReader, ids_to_units, truncate_records
-from .layout import MORE_STREAMS, SEGMENTATION, CameraSetup, read_json, sync_to_disk, write_json
+from .layout import MORE_STREAMS, CameraSetup, read_json, sync_to_disk, write_json
 from .validation import checked_name
 from .videos import VideoEncoder, VideoFile, as_rgb, count_frames, truncate_to_last_fragment
 
@@ -149,8 +149,8 @@ def _arrays(width: int, cameras: Sequence[CameraSetup]) -> dict[_Key, tuple[tupl
     arrays: dict[_Key, tuple[tuple[int, ...], DTypeLike]] = {_VALUES: ((width,), np.float64)}
     for index, camera in enumerate(cameras):
         for stream in (*camera.videos.values(), *camera.depths.values()):
-            dtype, more = STREAMS[stream]
-            arrays[index, stream] = (camera.height, camera.width, *more), dtype
+            kind = STREAMS[stream]
+            arrays[index, stream] = (camera.height, camera.width, *kind.shape), kind.dtype
     return arrays
 
 
@@ -208,10 +208,10 @@ class LiveFolder:
                     self._colors[name] = as_rgb(images[stream])
                 self._videos[name].add(self._colors[name])
             for name, stream in camera.depths.items():
-                if stream == SEGMENTATION:
-                    self._depths[name].add_units(ids_to_units(images[stream]) if new else None)
-                else:
+                if stream == "depth":
                     self._depths[name].add(images[stream] if new else None)
+                else:
+                    self._depths[name].add_units(ids_to_units(images[stream], STREAMS[stream].lowest) if new else None)
         row = self._pa.FixedSizeListArray.from_arrays(self._pa.array(slot.values), len(slot.values))
         self._rows.write_batch(self._pa.record_batch([row], schema=self._schema))
         self.count += 1

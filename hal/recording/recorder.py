@@ -92,9 +92,9 @@ class Recorder:
         task: Description of the task, stored with each episode.
         depth: False leaves depth out.
         cameras: Names of the cameras to record; None for all.
-        streams: Streams to record of each camera that has them: some of ``color``, ``depth``, ``infrared``,
-            ``infrared_right``, ``segmentation``; with ``objects``, the poses of a simulation's movable objects are
-            recorded as ``observation.environment_state``, for policies without pictures.
+        streams: Streams to record of each camera that has them: some of :data:`hal.types.STREAMS`; with ``objects``,
+            the poses of a simulation's movable objects are recorded as ``observation.environment_state``, for policies
+            without pictures.
         codec: ``h264``, ``av1``, or ``auto`` for the first that is available.
         warn_free: Free disk space below which :meth:`status` warns, bytes.
         stop_free: Free disk space below which an episode ends, bytes.

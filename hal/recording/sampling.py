@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..errors import CommandError, ConnectionLost, DeviceNotFound, StaleStateError
-from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, Stamp
+from ..types import AXES, BUTTONS, STREAMS, Frame, GripperState, PadState, RobotState, Stamp
 from .codecs import depth_unit_for
 from .layout import (
     ENVIRONMENT,
@@ -405,7 +405,7 @@ def select_devices(
         StaleStateError: The state of an arm is not available.
         ConnectionLost: A device is lost.
     """
-    there = ("color", "depth", *MORE_STREAMS, OBJECTS)
+    there = (*STREAMS, OBJECTS)
     if unknown := [stream for stream in streams if stream not in there]:
         raise CommandError(f"there is no stream {unknown[0]!r}; streams: {', '.join(there)}", code="unknown_stream")
     if not rig.robots:

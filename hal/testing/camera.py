@@ -123,11 +123,11 @@ class CameraContract(Contract):
         found = _images(frame)
         assert set(found) == set(spec.streams), "a frame has the streams of its spec, and None for all others"
         for stream, image in found.items():
-            dtype, more = STREAMS[stream]
-            shape = (spec.height, spec.width, *more)
-            assert (image.shape, image.dtype) == (shape, np.dtype(dtype)), (
-                f"{stream}: must be {shape} of {np.dtype(dtype).name}"
-            )
+            kind = STREAMS[stream]
+            shape, dtype = (spec.height, spec.width, *kind.shape), np.dtype(kind.dtype)
+            assert (image.shape, image.dtype) == (shape, dtype), f"{stream}: must be {shape} of {dtype.name}"
+            assert image.min() >= kind.lowest, f"{stream}: a value is at least {kind.lowest}"
+            assert kind.highest is None or image.max() <= kind.highest, f"{stream}: a value is at most {kind.highest}"
         if frame.depth is not None:
             assert np.isfinite(frame.depth).all(), "depth is 0 without a measurement, never NaN"
             measured = frame.depth[frame.depth != 0.0]
@@ -174,7 +174,7 @@ class CameraContract(Contract):
         assert info.clock in _CLOCKS, f"clock names the clock of t_device: one of {', '.join(_CLOCKS)}"
         assert info.depth_scale is None or info.depth_scale > 0.0, "depth_scale: metres in one unit"
         _check_matrix(info.K, spec.width, spec.height, "K")
-        infrared = {"infrared", "infrared_right"} & set(spec.streams)
+        infrared = [name for name in spec.streams if STREAMS[name].unaligned]
         assert info.K_infrared is not None or not infrared, "K_infrared: required with infrared"
         if info.K_infrared is not None:
             _check_matrix(info.K_infrared, spec.width, spec.height, "K_infrared")

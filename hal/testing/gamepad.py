@@ -10,7 +10,7 @@ import time
 from ..driver import PadReading
 from ..errors import HalError
 from ..gamepad import Gamepad
-from ..types import AXES, BUTTONS
+from ..types import AXES, BUTTONS, ONE_SIDED
 from .benches import Contract, PadBench, needs, run_in_thread
 
 __all__ = ["GamepadContract"]
@@ -83,7 +83,7 @@ class GamepadContract(Contract):
             assert set(reading.axes) <= set(AXES), f"axes are named as in hal.types.AXES: {', '.join(AXES)}"
             assert reading.buttons <= set(BUTTONS), f"buttons are named as in hal.types.BUTTONS: {', '.join(BUTTONS)}"
             for name, value in reading.axes.items():
-                lowest = 0.0 if name in ("l2", "r2") else -1.0
+                lowest = 0.0 if name in ONE_SIDED else -1.0
                 assert lowest <= value <= 1.0, f"{name} must be from {lowest:g} to 1"
             assert set(reading.unknown) <= set(AXES)
 

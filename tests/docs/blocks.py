@@ -5,6 +5,7 @@ a language, and ``text``, are pictures and output. A comment on the line before 
 
     <!-- file: NAME -->          written to that file, for the blocks after it; YAML, JSON are checked, Python compiled
     <!-- file: NAME, broken -->  the same, and the check must fail
+    <!-- copy: PATH -->          the text of that file of the repository, written as its name with all files beside it
     <!-- not run: WHY -->
 """
 
@@ -19,7 +20,7 @@ SHOWN = ("", "text", "toml")
 """Never run: pictures, output, and parts of other people's files."""
 
 _FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```\s*?$", re.MULTILINE | re.DOTALL)
-_COMMENT = re.compile(r"<!--\s*(file|not run):\s*(.*?)\s*-->\n\Z")
+_COMMENT = re.compile(r"<!--\s*(file|copy|not run):\s*(.*?)\s*-->\n\Z")
 
 
 class Block(NamedTuple):
@@ -29,7 +30,7 @@ class Block(NamedTuple):
     language: str
     text: str
     mark: str
-    """``file``, ``not run``, or nothing."""
+    """``file``, ``copy``, ``not run``, or nothing."""
     value: str
     """What the mark says."""
 

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -70,6 +71,12 @@ class Reader:
             else:
                 with pytest.raises(ConfigError):
                     check_yaml(block.text, self.folder, name)
+        elif block.mark == "copy":
+            copied = ROOT / block.value
+            assert block.text == copied.read_text(encoding="utf-8"), f"{block} is not {block.value}"
+            for file in copied.parent.iterdir():
+                if file.is_file():
+                    shutil.copy(file, self.folder)
         elif block.language == "python":
             self._python(block)
         elif block.language == "yaml":

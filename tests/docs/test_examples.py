@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -56,8 +59,34 @@ def test_the_unit_tests_with_the_mock_pass(tmp_path: Path) -> None:
     assert "3 passed" in done.stdout, done.stdout
 
 
+def test_the_driver_to_copy_passes_its_tests_outside_and_is_found_by_name_once_installed(tmp_path: Path) -> None:
+    """``tcp_arm.py`` with ``fake_arm.py`` and ``test_tcp_arm.py``: first as a folder, then as a package."""
+    folder = tmp_path / "tcp_arm"
+    shutil.copytree(EXAMPLES / "tcp_arm", folder, ignore=shutil.ignore_patterns("__pycache__"))
+    assert len((folder / "tcp_arm.py").read_text().splitlines()) <= 120
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tcp_arm"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=90)
+    assert "26 passed" in done.stdout, done.stdout + done.stderr
+    about = folder / "tcp_arm-1.0.dist-info"  # what pip would make of pyproject.toml
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: tcp-arm\nVersion: 1.0\n")
+    points = re.search(r'entry-points."(.*?)"\].*\n((?:\w.*\n)+)', (folder / "pyproject.toml").read_text())
+    (about / "entry_points.txt").write_text(f"[{points[1]}]\n{points[2].replace(chr(34), '')}")
+    words = ["teleop", "--config", "rig.yaml", "--real", "--dry-run", "--set", "robots.arm.drivers.real=tcp_arm"]
+    done = subprocess.run(
+        [sys.executable, "-m", "hal.apps.main", *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])},
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"arm\b.*\btcp_arm\b", done.stdout), done.stdout
+
+
 def test_every_example_is_tested_here_and_uses_nothing_private() -> None:
     here = Path(__file__).read_text()
-    for file in EXAMPLES.glob("*.py"):
+    for file in EXAMPLES.rglob("*.py"):
         assert file.name in here
         assert "._" not in file.read_text()

@@ -1,9 +1,9 @@
 // One pad out of everything that may drive at the same time: fingers on the page, keys, a gamepad.
 //
 // The server makes keys.js: AXES and BUTTONS are those of hal/types.py, in the order in which they are sent. Sticks and
-// d-pad are -1..1 (right and up positive), l2 and r2 are 0..1; bit k of a mask is button k.
+// d-pad are -1..1 (right and up positive), those of ONE_SIDED are 0..1; bit k of a mask is button k.
 
-import { AXES, BUTTONS } from "./keys.js";
+import { AXES, BUTTONS, ONE_SIDED } from "./keys.js";
 
 /** Name of an axis -> its place. */
 export const AXIS = Object.fromEntries(AXES.map((name, place) => [name, place]));
@@ -61,7 +61,7 @@ class Taps {
   }
 }
 
-const TRIGGERS = [AXIS.l2, AXIS.r2];
+const TRIGGERS = ONE_SIDED.map((name) => AXIS[name]);
 const PRESSED = 0.5;
 
 /** What one input device pushes and presses at the moment. */

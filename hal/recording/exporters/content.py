@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from ...errors import CommandError, DeviceNotFound
 from ...images import Cropping
+from ...types import STREAMS
 from ..dataset import Dataset, Episode
-from ..layout import GRIP_FORCE, MORE_STREAMS, SEGMENTATION, STATE, TAU_EXT, WRENCH_EXT
+from ..layout import GRIP_FORCE, MORE_STREAMS, STATE, TAU_EXT, WRENCH_EXT
 
 __all__ = [
     "ArmColumns",
@@ -100,7 +101,7 @@ class PictureStream:
 
     camera: str
     what: str
-    """``rgb``, ``depth``, ``infrared``, ``infrared_right`` or ``segmentation``."""
+    """``rgb``, or another stream by its name."""
     shape: tuple[int, ...]
     """(H, W, 3) or (H, W)."""
     dtype: np.dtype[Any]
@@ -214,10 +215,10 @@ class EpisodeContent:
         return tuple(found)
 
     def _stream(self, camera: str, what: str) -> PictureStream | None:
-        episode = self.episode
+        episode, stream = self.episode, "color" if what == "rgb" else what
 
         def read() -> Iterator[NDArray[Any]]:
-            return episode.pictures(camera, "color" if what == "rgb" else what)
+            return episode.pictures(camera, stream)
 
         try:
             first = next(read())
@@ -226,7 +227,7 @@ class EpisodeContent:
         scaling = self._scaling(first.shape[1], first.shape[0])
         if scaling is None:
             return PictureStream(camera, what, first.shape, first.dtype, self.rows, read)
-        scaled = scaling.depth if what in ("depth", SEGMENTATION) else scaling.color
+        scaled = scaling.depth if STREAMS[stream].exact else scaling.color
         shape = (*reversed(scaling.size), *first.shape[2:])
         return PictureStream(camera, what, shape, first.dtype, self.rows, lambda: map(scaled, read()))
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ...errors import DriverMissing
 from ...geometry import Pose
-from ...types import RobotStatus, Trip
+from ...types import STREAMS, RobotStatus, Trip
 from ..dataset import Episode
-from ..layout import SEGMENTATION, SETPOINT, STATE
+from ..layout import SETPOINT, STATE
 from .content import ArmColumns, EpisodeContent, PictureStream
 
 __all__ = ["write_rrd"]
@@ -171,8 +171,8 @@ def _picture(rr: Any, stream: PictureStream, picture: NDArray[Any]) -> Any:
         return rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
     if stream.what == "depth":
         return rr.EncodedDepthImage(_png(picture), media_type="image/png", meter=_DEPTH_UNITS)
-    if stream.what == SEGMENTATION:
-        return rr.SegmentationImage((picture + 1).astype(np.uint16))
+    if STREAMS[stream.what].exact:
+        return rr.SegmentationImage((picture - int(STREAMS[stream.what].lowest)).astype(np.uint16))
     return rr.Image(picture, color_model="L")
 
 

@@ -18,6 +18,14 @@ from hal.clock import RealClock
 from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConnectionLost, DeviceNotFound, StaleStateError
 from hal.specs import CameraSpec
+from hal.types import STREAMS
+
+
+def test_every_stream_is_a_field_of_both_records_of_a_frame() -> None:
+    for name, kind in STREAMS.items():
+        assert (name in RawFrame._fields, name in hal.Frame.__dataclass_fields__) == (True, True)
+        assert kind.like is None or kind.like in STREAMS
+        assert kind.highest is None or np.array([kind.lowest, kind.highest], kind.dtype)[1] == kind.highest
 
 
 def test_a_listener_gets_every_frame_and_one_that_fails_is_logged_and_dropped(

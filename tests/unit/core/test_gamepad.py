@@ -147,6 +147,24 @@ def test_a_button_that_was_pressed_counts_once_it_was_released(see: See, driver:
     assert see("south", "east").buttons == {"south", "east"}
 
 
+def test_an_axis_that_stays_where_it_is_put_blocks_nothing_and_counts_once_it_was_at_neutral(driver: Played) -> None:
+    driver.absolute = frozenset({"push_z"})
+    driver.shows("l2", push_z=0.7, unknown=("push_z",))
+    pad = Gamepad(driver)
+    pad.open(0.0)
+    seen = []
+    for push_z, left_x in ((0.7, 1.0), (0.1, 0.0), (0.8, 0.0)):
+        driver.shows(push_z=push_z, left_x=left_x)
+        pad.poll_once(driver.reading.t)
+        seen.append((pad.state().axis("left_x"), pad.state().axis("push_z") > 0.5))
+    assert seen == [(1.0, False), (0.0, False), (0.0, True)]
+    driver.shows(connected=False)
+    pad.poll_once(driver.reading.t)
+    driver.shows(push_z=0.8)
+    pad.poll_once(driver.reading.t)
+    assert pad.state().axis("push_z") == 0.0, "after a reconnection it has to pass neutral again"
+
+
 def test_an_unreported_axis_blocks_everything(driver: Played) -> None:
     driver.shows(unknown=("left_x",))
     pad = Gamepad(driver)

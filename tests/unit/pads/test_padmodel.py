@@ -90,6 +90,7 @@ def test_every_mistake_in_a_model_is_reported_at_once() -> None:
         "title": "Wrong",
         "axes": {"ABS_X": "left", "ABS_QX": "left_x"},
         "buttons": {"BTN_SOUTH": "cross"},
+        "absolute": ["l2", "push_z"],
         "motoin_node": "x",
         "match": [{"vendor": 0x10000, "bus": "pci"}],
     }
@@ -99,6 +100,7 @@ def test_every_mistake_in_a_model_is_reported_at_once() -> None:
         ("axes.ABS_X", "unknown_control"),
         ("axes.ABS_QX", "unknown_control"),
         ("buttons.BTN_SOUTH", "unknown_control"),
+        ("absolute.0", "unknown_control"),
         ("motoin_node", "unknown_key"),
         ("match.0.vendor", "out_of_range"),
         ("match.0.bus", "unknown_control"),
@@ -127,6 +129,14 @@ def test_axes_are_right_and_up_positive_and_normalised(code: str, value: int, co
     assert mapper.feed(EV_ABS, ABS[code], value)
     assert mapper.axes.pop(control) == pytest.approx(expected)
     assert not any(mapper.axes.values())
+
+
+def test_a_reversed_one_sided_axis_is_from_0_to_1() -> None:
+    model = MODELS["dualshock4"].model_copy(update={"axes": {"ABS_Z": "-l2"}, "absolute": ("push_z",)})
+    mapper = PadMapper(model, ranges(BYTE, BYTE))
+    for raw, expected in ((0, 1.0), (51, 0.8), (255, 0.0)):
+        mapper.feed(EV_ABS, ABS["ABS_Z"], raw)
+        assert mapper.axes["l2"] == pytest.approx(expected)
 
 
 def test_sticks_at_rest_are_near_zero_whatever_the_range() -> None:

@@ -48,6 +48,7 @@ def test_the_page_gets_the_constants_of_the_project() -> None:
         match[1]: json.loads(match[2]) for line in lines if (match := re.fullmatch(r"export const (\w+) = (.*);", line))
     }
     assert (found["AXES"], found["BUTTONS"], found["PAD_SILENCE"]) == ([*STICK_AXES], [*BUTTONS], PAD_SILENCE)
+    assert found["ONE_SIDED"] == ["l2", "r2"]
     used = {
         name
         for text in read_page_files().values()
