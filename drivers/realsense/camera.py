@@ -64,7 +64,7 @@ class RealSenseCamera(CameraDriver):
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
         """Check the options; raises ConfigError."""
         super().__init__(spec, source)
-        self._settings = RealSenseSettings.from_spec(spec)
+        self._settings = RealSenseSettings.of(spec)
         played = self._settings.play is not None
         self.on_demand = played and not self._settings.paced
         self._silence = max(self._settings.stall_s, _PLAYED_STALL if played else 0.0, 3.0 / spec.rate_hz) + _MARGIN

@@ -52,7 +52,7 @@ class RealSenseDevice:
             notify: Called with news (``frame``: a number; ``lost``: a packed error) from the streaming thread.
         """
         self._spec = spec
-        self._settings = RealSenseSettings.from_spec(spec)
+        self._settings = RealSenseSettings.of(spec)
         self._ring = ring
         self._notify = notify
         self._context, self._emulated = self._create_context(spec)

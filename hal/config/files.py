@@ -27,11 +27,13 @@ import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import ConfigError, Problem
+from ..specs import CameraSpec, GripperSpec, RobotSpec
 from .data_files import data_folder, is_path, list_data, user_path
-from .schema import ValueProblem, describe, find_kind, find_record, list_keys
+from .schema import Strict, ValueProblem, describe, find_kind, find_record, list_keys
 
 __all__ = [
     "PlacedErrors",
+    "DeviceSettings",
     "Problems",
     "apply_overrides",
     "check_size",
@@ -314,6 +316,29 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
             if right is not None:
                 guessed.add(right)
                 problems.written[str(file), _join_key(prefix, right)] = str(one["loc"][-1])
+
+
+class DeviceSettings(Strict):
+    """Base of the settings that a driver takes under ``real:`` of a device."""
+
+    @classmethod
+    def of(cls: type[M], spec: RobotSpec | GripperSpec | CameraSpec) -> M:
+        """Return the settings in a device's record. Raises ConfigError, which lists every problem."""
+        problems, section = Problems(), "cameras" if isinstance(spec, CameraSpec) else "robots"
+        settings = validate(cls, spec.options, f"{section}.{spec.name}.real", problems)
+        problems.raise_any()
+        return settings
+
+    @classmethod
+    def check(cls: type[M], spec: RobotSpec | GripperSpec | CameraSpec) -> tuple[M | None, list[tuple[str, str, str]]]:
+        """Return the settings in a device's record, None if they have problems, and the problems.
+
+        A problem is a key in the device's entry of the rig file, a message and a code.
+        """
+        problems = Problems()
+        settings = validate(cls, spec.options, "", problems, "real")
+        found = [(problem.key, problem.message, problem.code) for problem in problems.found]
+        return (None if found else settings), found
 
 
 def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folder: str, kind: str) -> M:

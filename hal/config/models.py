@@ -98,6 +98,17 @@ class LimitsModel(Strict):
     torque: Torques | None = None
 
 
+UNITS = {
+    "lower": "rad",
+    "upper": "rad",
+    "velocity": "rad/s",
+    "acceleration": "rad/s2",
+    "jerk": "rad/s3",
+    "torque": "Nm",
+}
+"""Key of :class:`LimitsModel` -> its unit."""
+
+
 class TcpModel(Strict):
     """The tool centre point in the frame of a link."""
 
