@@ -321,9 +321,7 @@ class DamiaoChain:
             f"no answer from {names} on {self.settings.channel} for {1e3 * SILENCE:.0f} ms",
             "check its power and its cable; the arm may sink",
         )
-        error = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
-        error.fault = fault
-        return error
+        return ConnectionLost.of(self.name, fault)
 
     def ask_registers(self) -> bool:
         """Ask motors that were off for their registers, one at a time; return whether some are still missing.
@@ -350,8 +348,7 @@ class DamiaoChain:
             return
         fault = self.register_fault()
         if fault is not None:
-            self.lost = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
-            self.lost.fault = fault
+            self.lost = ConnectionLost.of(self.name, fault)
         elif not waiting:
             self.lost = None
 

@@ -227,8 +227,7 @@ class PiperLink:
     def lose(self, what: str) -> ConnectionLost:
         """Return the exception for a device that does not report any more, and note that it is lost."""
         remedy = silence_remedy(self._open_bus(), self.source)
-        self.lost = ConnectionLost(f"{self.name}: {what}; {remedy}", code="silent")
-        self.lost.fault = Fault("silent", what, remedy)
+        self.lost = ConnectionLost.of(self.name, Fault("silent", what, remedy))
         return self.lost
 
     def statistics(self) -> dict[str, Any]:

@@ -482,10 +482,7 @@ class ArmConnection:
 
     def error(self, fault: Fault | None = None) -> ConnectionLost:
         """Return the exception to raise while there is no connection."""
-        fault = fault or self.lost or Fault("closed", "it is not open", "open the rig")
-        error = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
-        error.fault = fault
-        return error
+        return ConnectionLost.of(self.name, fault or self.lost or Fault("closed", "it is not open", "open the rig"))
 
     def close(self) -> None:
         """Disconnect, and release the arm for other programs. Idempotent."""
