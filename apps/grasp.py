@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from hal.apps._common import run_app
 from hal.apps._skills import SkillApp, add_skill_options, run_skill
+from hal.errors import NotSupported
 
 if TYPE_CHECKING:
     from hal.skills import SkillResult
@@ -45,7 +46,6 @@ def _main(args: argparse.Namespace) -> int:
 
 def _grasp(app: SkillApp) -> SkillResult | None:
     """Find the object and grasp it."""
-    from hal.errors import NotSupported
     from hal.skills import gentle_grasp, grasp, grasp_pose
 
     arm, args = app.robot, app.args

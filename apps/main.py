@@ -20,7 +20,9 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import hal
 from hal.apps._common import run_app
+from hal.errors import CommandError, DriverMissing
 
 __all__ = ["BESIDE", "GROUP", "PROGRAMS", "main", "parser"]
 
@@ -80,8 +82,6 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(args: argparse.Namespace) -> int:
-    import hal
-
     if args.version:
         print(f"robot-hal {hal.__version__}")
     elif args.command == "list":
@@ -110,7 +110,6 @@ def _find_program(name: str) -> Callable[[list[str]], int]:
     from importlib.metadata import entry_points  # slow to import, so only when it is needed
 
     from hal.config.files import suggest
-    from hal.errors import CommandError, DriverMissing
 
     for point in entry_points(group=GROUP, name=name):
         loaded: Callable[[list[str]], int] = point.load()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hal.apps._common import ACTION_NEEDED, run_app
+from hal.apps._display import count_episodes
 from hal.errors import CommandError, DatasetError
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def _check(args: argparse.Namespace, dataset: Dataset) -> int:
         print(json.dumps({"path": str(dataset.root), "episodes": count, "wrong": found}, indent=2))
     else:
         remedy = f"; next: {repair_command(DatasetLayout(dataset.root))}" if found else ""
-        end = f"{count} episode{'' if count == 1 else 's'} checked, {len(found)} problem(s){remedy}"
+        end = f"{count_episodes(count)} checked, {len(found)} problem(s){remedy}"
         print("\n".join([*found, end]))
     return ACTION_NEEDED if found else 0
 
@@ -179,8 +180,7 @@ def _table(found: DatasetSummary) -> Iterator[str]:
     """Yield the statistics, line by line."""
     from hal.recording.metadata import SLOW_PACE
 
-    count = len(found.episodes)
-    many = f"{count} episode{'' if count == 1 else 's'}"
+    many = count_episodes(len(found.episodes))
     yield f"{found.path}: {many} of {found.robot_type}, {found.rows} rows at {found.fps} Hz, {found.seconds:.1f} s"
     marked = found.successes + found.failures
     share = f" ({100 * found.successes / marked:.0f} % of those marked)" if marked else ""
