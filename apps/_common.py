@@ -9,9 +9,10 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -441,6 +442,19 @@ def interruptible() -> Iterator[None]:
     finally:
         for name, handler in before.items():
             signal.signal(getattr(signal, name), handler)
+
+
+def program(parser: Callable[[], argparse.ArgumentParser]) -> Callable[[Callable[[Any], int]], Callable[..., int]]:
+    """Make a function of the parsed options one of the command line, without arguments of that of the process."""
+
+    def decorate(main: Callable[[Any], int]) -> Callable[..., int]:
+        @wraps(main)
+        def run(argv: list[str] | None = None) -> int:
+            return run_app(main, parser(), argv)
+
+        return run
+
+    return decorate
 
 
 def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) -> int:

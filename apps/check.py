@@ -18,7 +18,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, TextIO
 
 from hal import registry
-from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, run_app
+from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, program
 from hal.errors import CommandError, HalError
 
 if TYPE_CHECKING:
@@ -400,12 +400,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.config import load
     from hal.preflight import list_checked_cameras, list_real_arms, preflight
 

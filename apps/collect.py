@@ -20,9 +20,9 @@ from hal.apps._common import (
     check_driving_options,
     check_report,
     load_named,
+    program,
     resolve_plan,
     rig_options,
-    run_app,
     select_robots,
     split_names,
 )
@@ -76,11 +76,6 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run ``collect``; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
 def _check_options(args: argparse.Namespace) -> None:
     """Check the options that need no rig. Raises CommandError, ConfigError or DeviceNotFound."""
     check_driving_options(args)
@@ -92,7 +87,9 @@ def _check_options(args: argparse.Namespace) -> None:
     check_report(args.report)
 
 
-def _main(args: argparse.Namespace) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
+    """Run ``collect``; return the exit status."""
     from hal.apps._collecting import CollectRun, lifts_cube
     from hal.config.data_files import data_folder
     from hal.recording import Recorder, recover

@@ -14,7 +14,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app
+from hal.apps._common import program
 from hal.apps._display import StatusLine, count_episodes
 from hal.errors import CommandError
 
@@ -99,12 +99,9 @@ def _add_trim_options(trimming: argparse.ArgumentParser) -> None:
     add("--yes", action="store_true", help="do not ask")
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.recording import Dataset, delete_episodes, extract, mark_episodes, merge, pack, set_task, split
     from hal.recording.exporters.content import select_episodes
 

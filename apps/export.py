@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app, split_names
+from hal.apps._common import program, split_names
 from hal.apps._display import StatusLine, count_episodes
 from hal.errors import CommandError
 
@@ -72,12 +72,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.recording.exporters import export
 
     made = export(

@@ -25,8 +25,8 @@ from hal.apps._common import (
     add_stream_options,
     check_episode_options,
     config_options,
+    program,
     resolve_plan,
-    run_app,
     split_names,
     write_report,
 )
@@ -101,12 +101,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
     from hal.learning.generate import LocalWorker, StartWorker, generate, parts_folder

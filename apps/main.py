@@ -21,7 +21,7 @@ from importlib import import_module
 from pathlib import Path
 
 import hal
-from hal.apps._common import run_app
+from hal.apps._common import program
 from hal.errors import CommandError, DriverMissing
 
 __all__ = ["BESIDE", "GROUP", "PROGRAMS", "main", "parser"]
@@ -76,12 +76,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     if args.version:
         print(f"robot-hal {hal.__version__}")
     elif args.command == "list":

@@ -19,9 +19,9 @@ from hal.apps._common import (
     check_speed,
     find_deadman,
     needs_deadman,
+    program,
     resolve_plan,
     rig_options,
-    run_app,
     write_report,
 )
 from hal.apps._display import StatusLine, banner, list_links
@@ -64,12 +64,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.recording import Dataset
     from hal.recording.checking import check_rows
 

@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hal.apps._common import ACTION_NEEDED, run_app
+from hal.apps._common import ACTION_NEEDED, program
 from hal.apps._display import count_episodes
 from hal.errors import CommandError, DatasetError
 
@@ -68,12 +68,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.recording import Dataset
     from hal.recording.exporters.content import select_episodes
     from hal.recording.review import summarize, summary_as_json

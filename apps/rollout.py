@@ -29,9 +29,9 @@ from hal.apps._common import (
     find_deadman,
     load_named,
     needs_deadman,
+    program,
     resolve_plan,
     rig_options,
-    run_app,
     write_report,
 )
 from hal.apps._display import StatusLine, banner, list_links, to_ms
@@ -118,12 +118,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.learning.policy_config import load_policy_config
 
     remote = is_remote(args.policy)

@@ -16,9 +16,9 @@ from hal.apps._common import (
     add_rig_options,
     check_driving_options,
     check_report,
+    program,
     resolve_plan,
     rig_options,
-    run_app,
     select_robots,
     write_report,
 )
@@ -49,12 +49,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run ``teleop``; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     check_driving_options(args)
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
