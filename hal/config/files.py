@@ -357,22 +357,36 @@ def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folde
     if isinstance(given, model):
         return given
     problems = Problems()
-    if isinstance(given, Mapping):
-        result = validate(model, given, "<dict>", problems)
-    else:
-        name = str(given)
-        if isinstance(given, Path) or is_path(name):
-            path = user_path(name, Path.cwd())
-        elif name in (there := list_data("config", folder)):
-            path = data_folder("config") / folder / f"{name}.yaml"
-        else:
-            message = f"there is no {kind.replace('_', ' ')} {name!r}{suggest(name, there)}, or a path to your own"
-            raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), message, f"unknown_{kind}")])
-        data = read_yaml(path, problems)
+    file: Path | str = "<dict>"
+    data: Any = given
+    if not isinstance(given, Mapping):
+        file = find_file(given, kind.replace("_", " "), Path.cwd(), "config", folder)
+        if isinstance(file, str):
+            raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), file, f"unknown_{kind}")])
+        data = read_yaml(file, problems)
         problems.raise_any()
-        result = validate(model, data, path, problems)
+    result = validate(model, data, file, problems)
     problems.raise_any()
     return result
+
+
+def find_file(given: str | Path, kind: str, base: Path, folder: str, *parts: str) -> Path | str:
+    """Return the path of a YAML file, or a message if there is none.
+
+    Args:
+        given: A path, or the name of a built-in file.
+        kind: What the file is, for the message.
+        base: Folder that a path is relative to.
+        folder: Data folder of the built-in files.
+        parts: Folders below it.
+    """
+    name = str(given)
+    if isinstance(given, Path) or is_path(name):
+        return user_path(given, base)
+    there = list_data(folder, *parts)
+    if name not in there:
+        return f"there is no {kind} {name!r}{suggest(name, there)}, or a path to your own"
+    return data_folder(folder).joinpath(*parts, f"{name}.yaml")
 
 
 def leave_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:

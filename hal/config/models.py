@@ -6,13 +6,12 @@ A model of your own is a file with the same keys, which a rig names by its path.
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, read_yaml, suggest
+from .data_files import data_folder, list_data
+from .files import Problems, read_yaml
 from .schema import (
     Accelerations,
     CameraRate,
@@ -59,7 +58,6 @@ __all__ = [
     "StreamModel",
     "ToolModel",
     "expand_names",
-    "find_model",
     "load_pad_models",
 ]
 
@@ -435,24 +433,6 @@ class CompleteStream(NamedTuple):
 
 
 # Files
-
-
-def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Path | str:
-    """Return the path of a model, or a message if there is none.
-
-    Args:
-        name: A path, or the name of a built-in model.
-        folder: Data folder of the built-in models, and ``parts`` the folders below it.
-        parts: See ``folder``.
-        base: Folder that a path is relative to.
-    """
-    if is_path(name):
-        return user_path(name, base)
-    there = list_data(folder, *parts)
-    if name not in there:
-        kind = (folder, *parts)[-1].removesuffix("s")
-        return f"there is no {kind} model {name!r}{suggest(name, there)}, or a path to your own"
-    return data_folder(folder).joinpath(*parts, f"{name}.yaml")
 
 
 def load_pad_models(problems: Problems) -> dict[str, dict[str, Any]]:
