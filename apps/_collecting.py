@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from hal.types import PadState
 
-__all__ = ["BackgroundRecorder", "CollectRun", "SavedEpisode", "episode_seed", "lifts_cube"]
-
 TOO_FEW = 1
 """Exit status if fewer episodes were saved than asked for."""
 SHOW_PERIOD = 0.2

@@ -28,29 +28,6 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from hal.specs import Plan
 
-__all__ = [
-    "ACTION_NEEDED",
-    "add_config_options",
-    "add_deadman_options",
-    "add_driving_options",
-    "add_episode_options",
-    "add_rig_options",
-    "check_driving_options",
-    "check_episode_options",
-    "check_everything",
-    "check_one_robot",
-    "check_report",
-    "config_options",
-    "find_deadman",
-    "interruptible",
-    "needs_deadman",
-    "resolve_plan",
-    "rig_options",
-    "robot_names",
-    "run_app",
-    "select_robots",
-]
-
 ACTION_NEEDED = 2
 """Exit status when the user has to fix something first."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from hal.teleop import ArmTeleop
     from hal.types import RobotState
 
-__all__ = ["RunReport", "StatusLine", "TeleopDisplay", "banner", "list_devices", "list_links"]
-
 
 def count_episodes(count: int) -> str:
     """Return a number of episodes in words."""

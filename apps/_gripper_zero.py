@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from hal.rig import Rig
     from hal.specs import Plan, RobotSpec
 
-__all__ = ["find_zero", "gripper_parser"]
-
 LONGEST = 120.0
 """Time after which the search ends, s, however long the dead-man was held."""
 _PERIOD = 0.01

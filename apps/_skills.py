@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from hal.skills import LocatedObject, SkillProgress, SkillResult
     from hal.types import Frame
 
-__all__ = ["FAILED", "SkillApp", "add_skill_options", "run_skill"]
-
 FAILED = 1
 """Exit status if the skill did not succeed."""
 

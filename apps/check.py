@@ -27,12 +27,6 @@ if TYPE_CHECKING:
     from hal.specs import PadSpec, Plan
     from hal.types import PadState
 
-__all__ = [
-    "main",
-    "may_open",
-    "parser",
-]
-
 # --cameras: the cameras that are plugged in, with the keys that select each of them in a rig file.
 
 

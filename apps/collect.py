@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from hal.robot import Robot
 
-__all__ = ["main", "parser"]
-
 DEMO_MISPLACED = (
     "--pad demo reaches for the places that --seed 0 gives the cube in the first two episodes of a new folder; here "
     "the cube is elsewhere, so the gripper closes on air, and the episode is saved as a failure"

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from hal.recording import Dataset, Episode
 
-__all__ = ["main", "parser"]
-
 MARKS: dict[str, bool | None] = {"success": True, "failure": False, "none": None}
 PARTS = {True: "success", False: "failure", None: "unmarked"}
 NAMES = {mark: name if mark is not None else "-" for name, mark in MARKS.items()}

@@ -20,8 +20,6 @@ from hal.errors import CommandError
 if TYPE_CHECKING:
     from hal.recording.exporters import ExportProgress
 
-__all__ = ["main", "parser"]
-
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from hal.learning.generate import GenerateProgress
     from hal.specs import Plan
 
-__all__ = ["main", "parser"]
-
 _PERIOD = 10.0
 """Time between two lines of progress if the output is not a terminal, s."""
 EXAMPLES = """\

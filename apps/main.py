@@ -24,8 +24,6 @@ import hal
 from hal.apps._common import program
 from hal.errors import CommandError, DriverMissing
 
-__all__ = ["BESIDE", "GROUP", "PROGRAMS", "main", "parser"]
-
 PROGRAMS = {
     "teleop": "drive an arm: page in a browser, gamepad, terminal, recorded tour",
     "check": "check this computer, arms and cameras; list gamepads and CAN adapters",

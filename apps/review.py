@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from hal.recording.dataset import Dataset, Episode
     from hal.recording.review import ColumnSpread, DatasetSummary
 
-__all__ = ["main", "parser"]
-
 LEAVE_OUT = (
     "restore the files of a damaged episode from a copy, or leave it out with hal export --episodes; "
     "docs/record.md describes how to remove the last one"

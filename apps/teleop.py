@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from hal.types import PadState
 
-__all__ = ["TeleopRun", "main", "parser"]
-
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``teleop``."""

@@ -24,8 +24,6 @@ from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, DriverMissin
 
 from .settings import BusSettings
 
-__all__ = ["CanBus", "FrameHandler"]
-
 FrameHandler = Callable[[bytearray], None]
 """Function that a frame's data is handed to."""
 

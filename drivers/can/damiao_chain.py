@@ -28,8 +28,6 @@ from .damiao_protocol import (
 )
 from .settings import BusSettings, DamiaoMotorSettings, emulator_remedy, is_emulated
 
-__all__ = ["SILENCE", "SWITCHING", "DamiaoChain"]
-
 Weight = Callable[[Sequence[float]], Sequence[float]]
 """Function that returns the torques (n,), Nm, that carry a device at joint positions (n,), rad."""
 

@@ -14,18 +14,6 @@ from .bus import CanBus
 from .piper_protocol import COMMAND_IDS, ENABLED, JOINTS, GripperStatus, PiperFeedback, PiperStatus, decode_feedback
 from .settings import EMULATED_INTERFACES, BusSettings, emulator_remedy
 
-__all__ = [
-    "FRESH_READS",
-    "SILENCE",
-    "PiperLink",
-    "arm_fault",
-    "control_fault",
-    "gripper_fault",
-    "join_joints",
-    "refusal",
-    "silence_remedy",
-]
-
 SILENCE = 0.1
 """Silence after which the arm or the gripper counts as lost, s."""
 FRESH_READS = 2

@@ -23,22 +23,6 @@ from hal.specs import GripperSpec, RobotSpec
 from .damiao_protocol import KD_MAX, KP_MAX, MASTER_OFFSET, MOTOR_RANGES, MotorRange
 from .piper_protocol import JOINTS
 
-__all__ = [
-    "BusSettings",
-    "DamiaoArmSettings",
-    "DamiaoGripperSettings",
-    "DamiaoMotorSettings",
-    "PiperArmSettings",
-    "PiperGripperSettings",
-    "check_damiao_arm",
-    "check_damiao_gripper",
-    "check_piper_arm",
-    "check_piper_gripper",
-    "emulator_remedy",
-    "group_key",
-    "is_emulated",
-]
-
 EMULATED_INTERFACES = frozenset({"virtual", "udp_multicast"})
 """Interfaces of python-can behind which there is no hardware."""
 _SHAREABLE = frozenset({"socketcan", "udp_multicast"})

@@ -15,8 +15,6 @@ from hal.pads.model import MatchRule, PadModel
 from .finder import EvdevNode, NodeInfo
 from .rumble import Rumble
 
-__all__ = ["PadLink"]
-
 _SEPARATE = frozenset({KEY["BTN_MODE"], KEY["BTN_LEFT"]})
 """Buttons that may come in reports of their own, which tell nothing about the other controls: xpad does so with the
 Xbox button of an Xbox One pad."""

@@ -23,8 +23,6 @@ from hal.types import AXES
 from .finder import DeviceFinder, EvdevNode, LinuxInput, NodeInfo, evdev_module, permission_note
 from .link import PadLink
 
-__all__ = ["EvdevPad"]
-
 _RELEASED = MappingProxyType(dict.fromkeys(AXES, 0.0))
 
 

@@ -33,8 +33,6 @@ from .link import ArmLink, ArmMode, ArmSample, StreamKind
 from .network import PortState, lock_arm, probe_port, resolve_host
 from .settings import ArmSettings, is_emulated
 
-__all__ = ["ArmConnection", "FrankaArm", "create_link"]
-
 _RECOVERY_TIMEOUT = 3.0
 """Longest time until the robot is idle after a recovery, s."""
 _RATED_COMMANDS = 200

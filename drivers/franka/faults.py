@@ -14,23 +14,6 @@ from hal.errors import Fault
 
 from .flags import FLAG_TEXTS, LOSSY_FLAGS
 
-__all__ = [
-    "ARM_PORT",
-    "HAND_PORT",
-    "KNOWN_ERRORS",
-    "NO_HAND",
-    "NO_ROUTE",
-    "REFUSED",
-    "UNKNOWN_HOST",
-    "UNREACHABLE",
-    "KnownError",
-    "fault_of",
-    "fault_of_exception",
-    "flags_in",
-    "is_connection_lost",
-    "version_fault",
-]
-
 ARM_PORT, HAND_PORT = 1337, 1338
 """Fixed TCP ports of the arm and of the Franka Hand."""
 _CODE, _CAUSE = 48, 160

@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
-__all__ = ["ELBOW_FLIP", "FER", "FR3", "LIMITS", "ArmLimits"]
-
 Seven = tuple[float, float, float, float, float, float, float]
 
 ELBOW_FLIP = -0.467002423653011

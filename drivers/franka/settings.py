@@ -22,17 +22,6 @@ from hal.specs import Floats, GripperSpec, RobotSpec
 
 from .limits import LIMITS, ArmLimits
 
-__all__ = [
-    "ArmSettings",
-    "CollisionBehavior",
-    "FrameSetting",
-    "HandSettings",
-    "LoadSetting",
-    "check_arm",
-    "check_hand",
-    "is_emulated",
-]
-
 _NO_ADDRESS = (
     "is missing: the robot's address, as Desk shows it; pass it with --set KEY=ADDRESS (overrides= of hal.open), "
     "KEY as above, or write it into a rig file of your own"

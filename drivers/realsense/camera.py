@@ -20,8 +20,6 @@ from hal.specs import CameraSpec, to_json
 
 from .options import RealSenseSettings
 
-__all__ = ["RealSenseCamera"]
-
 if importlib.util.find_spec("pyrealsense2") is None:  # this process does without it, the camera's own does not
     raise ModuleNotFoundError("No module named 'pyrealsense2'", name="pyrealsense2")
 

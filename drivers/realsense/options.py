@@ -19,18 +19,6 @@ from hal.config.schema import Flag, Quantity, Seconds, ValueProblem, describe, i
 from hal.errors import CommandError, NotSupported
 from hal.specs import CameraSpec
 
-__all__ = [
-    "COLOR_FORMATS",
-    "FORMATS",
-    "RealSenseSettings",
-    "Sensors",
-    "apply_options",
-    "find_sensors",
-    "has_auto_exposure",
-    "problems",
-    "read_options",
-]
-
 COLOR_FORMATS = ("rgb8", "bgr8", "rgba8", "bgra8", "yuyv", "uyvy")
 """Colour formats that are converted to RGB, the cheapest first."""
 FORMATS = {"color": COLOR_FORMATS, "depth": ("z16",), "infrared": ("y8",), "infrared_right": ("y8",)}

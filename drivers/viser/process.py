@@ -26,8 +26,6 @@ from hal.types import Limited, Trip
 from .guard import HOST, start_server
 from .scene import ArmView, BodiesView
 
-__all__ = ["PORT", "StatusPanel", "ViewerPage", "arm_status", "main"]
-
 PORT = 8080
 """The first port to try."""
 _NICE = 10

@@ -27,8 +27,6 @@ from hal.types import RobotState, Trip
 from .goals import HandleDrag
 from .meshes import visuals_glb
 
-__all__ = ["ArmView", "BodiesView", "shown_visuals", "workspace_lines"]
-
 Vector = Sequence[float] | NDArray[np.float64]
 
 _OPEN_SIDE = 0.8

@@ -34,8 +34,6 @@ from .pad import PadQueue, WebPad, lost_reading, pad_reading
 if TYPE_CHECKING:
     from hal.rig import Rig
 
-__all__ = ["ProcessChannel", "WebConsole", "recording_message"]
-
 _TOKEN_BYTES = 18
 _STREAMS = ("color", "infrared", "depth")
 """A page shows the first of these streams that a camera has."""

@@ -13,32 +13,6 @@ from typing import Generic, NamedTuple, TypeVar
 from hal.types import BUTTONS, STICK_AXES
 from hal.views import ACTIONS, FRAMES, SETTINGS
 
-__all__ = [
-    "ALARMS",
-    "CLOCK_AHEAD",
-    "MAX_BYTES",
-    "MESSAGES_LATE",
-    "PAGE_CLOSED",
-    "PAGE_GONE",
-    "PAGE_SILENT",
-    "RELEASE_MISSED",
-    "ControlRequest",
-    "MalformedMessage",
-    "Outbox",
-    "PadMessage",
-    "PageLeft",
-    "PageMessage",
-    "PictureDrawn",
-    "RecordingRequest",
-    "RecoverRequest",
-    "SettingRequest",
-    "StopRequest",
-    "TourRequest",
-    "WatchRequest",
-    "encode",
-    "parse",
-]
-
 MAX_BYTES = 4096
 """Longest message of a page."""
 PAGE_CLOSED = "the page in control was closed"

@@ -35,8 +35,6 @@ from .session import WebPage, WebSession, make_app_queue
 from .sockets import CONNECTIONS, ConnectionLimit, PageSocket, PageSockets
 from .telemetry import Telemetry
 
-__all__ = ["ConsoleServer", "keys_module", "make_app", "open_listener", "read_page_files"]
-
 _STATE_PERIOD = 0.05
 """Time between two states, in s."""
 _KERNEL_BYTES = 4096

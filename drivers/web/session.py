@@ -35,17 +35,6 @@ from .messages import (
     parse,
 )
 
-__all__ = [
-    "DriveLease",
-    "LeaseChange",
-    "PadVerdict",
-    "PadWatch",
-    "SendQueue",
-    "WebPage",
-    "WebSession",
-    "make_app_queue",
-]
-
 _MAX_REQUESTS = 16
 """Requests of pages that may wait for the app."""
 _MAX_NOTES = 256

@@ -28,17 +28,6 @@ from .models import CameraModel, FileSource, GripperModel, RobotModel
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
-__all__ = [
-    "Context",
-    "check_camera_spec",
-    "check_robot_spec",
-    "find_mesh",
-    "is_emulated",
-    "load_arm",
-    "load_urdf",
-    "merge_options",
-]
-
 Model = TypeVar("Model", RobotModel, CameraModel)
 Config = RobotConfig | GripperConfig | CameraConfig
 DrivenModel = RobotModel | GripperModel | CameraModel
@@ -92,7 +81,7 @@ class Context:
         self.problems.add(self.source, key, message, code)
 
     def check_link(self, file: str, key: str, robot: str, link: str) -> None:
-        """Add a problem if there is no such robot, or it has no such link; ``key`` has the keys ``robot`` and ``link``."""
+        """Add a problem if there is no such robot, or it has no such link; ``key`` is that of both."""
         if robot not in self.rig.robots:
             message = f"this rig has no robot {robot!r}{suggest(robot, self.rig.robots)}"
             self.problems.add(file, f"{key}.robot", message, "unknown_device")

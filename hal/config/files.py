@@ -31,23 +31,6 @@ from ..specs import CameraSpec, GripperSpec, RobotSpec
 from .data_files import data_folder, is_path, list_data, user_path
 from .schema import Strict, ValueProblem, describe, find_kind, find_record, list_keys
 
-__all__ = [
-    "PlacedErrors",
-    "DeviceSettings",
-    "Problems",
-    "apply_overrides",
-    "check_size",
-    "find_closest",
-    "load_record",
-    "suggest",
-    "parse_yaml",
-    "copy_plain",
-    "read_yaml",
-    "validate",
-    "leave_holes",
-    "describe_yaml_error",
-]
-
 
 class Problems:
     """The problems found so far, each once."""

@@ -19,8 +19,6 @@ from .files import Problems, apply_overrides, find_file, read_yaml, suggest, val
 from .resolve import resolve
 from .rigfile import RigFile
 
-__all__ = ["RigConfig", "load"]
-
 CLOCKS = ("real_time", "lock_step")
 
 

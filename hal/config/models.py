@@ -25,7 +25,6 @@ from .schema import (
     Name,
     Offset,
     Pixels,
-    PoseConfig,
     Quantity,
     QuaternionConfig,
     RateHz,
@@ -39,27 +38,6 @@ from .schema import (
     Velocities,
     ViewAngle,
 )
-
-__all__ = [
-    "CameraModel",
-    "Capture",
-    "CompleteStream",
-    "Depth",
-    "DepthSensor",
-    "Drivers",
-    "FieldOfView",
-    "FileSource",
-    "GripperModel",
-    "LimitsModel",
-    "Mode",
-    "PoseConfig",
-    "RobotModel",
-    "SensorStream",
-    "StreamModel",
-    "ToolModel",
-    "expand_names",
-    "load_pad_models",
-]
 
 
 class Drivers(Strict):

@@ -35,8 +35,6 @@ from .schema import (
     describe,
 )
 
-__all__ = ["CarriedBy", "ObjectConfig", "RandomPose", "load_objects"]
-
 _ENDS = "the least and the greatest"
 
 

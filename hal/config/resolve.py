@@ -30,8 +30,6 @@ from .resolve_robots import resolve_robot
 from .rigfile import Device, PadConfig
 from .schema import Unknown
 
-__all__ = ["resolve", "resolve_pad"]
-
 CHOSEN_LATER = "auto"
 """Stands for a pad that is chosen when the rig opens, in place of the name of a driver."""
 

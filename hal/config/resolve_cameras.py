@@ -17,12 +17,6 @@ from .models import CameraModel, Capture
 from .rigfile import CameraConfig, Output, Stream, StreamConfig, make_view
 from .schema import Unknown
 
-__all__ = [
-    "Streams",
-    "resolve_camera",
-    "resolve_streams",
-]
-
 _ONE_SENSOR: tuple[Stream, ...] = ("depth", "infrared", "infrared_right")
 """Streams that a depth camera computes from the same images: of one size, at one rate."""
 _RENDERED = "segmentation"

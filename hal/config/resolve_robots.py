@@ -31,8 +31,6 @@ from .models import UNITS, LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig, WorkspaceConfig
 from .schema import Quantity, Unknown
 
-__all__ = ["resolve_limits", "resolve_robot", "spread"]
-
 MOST_REAL = {
     "velocity": Quantity("rad/s", 0.0, 15.0, above=True),
     "acceleration": Quantity("rad/s2", 0.0, 100.0, above=True),
