@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from hal.apps._common import ACTION_NEEDED
+from hal.apps._common import ACTION_NEEDED, write_report
 from hal.apps._display import TeleopDisplay, list_links
 from hal.errors import CommandError, HalError
 from hal.learning.episode import stands_in_world
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.types import PadState
-
-__all__ = ["BackgroundRecorder", "CollectRun", "SavedEpisode", "episode_seed", "lifts_cube"]
 
 TOO_FEW = 1
 """Exit status if fewer episodes were saved than asked for."""
@@ -381,19 +378,18 @@ class CollectRun:
         """Print the results and write ``--report``, once everything is saved; return the number of saved episodes."""
         for text in _summary(self.kept, self.recorder.root, self.discarded, ended):
             self.display.line.event(text)
-        if self.args.report:
-            report = {
-                "out": str(self.recorder.root),
-                "robot": self._names,
-                "backend": self.robots[0].spec.driver,
-                "clock": self.rig.plan.clock,
-                "ended": ended,
-                "discarded": self.discarded,
-                "trips": self.display.report.trips,
-                "faults": self.display.report.faults,
-                "episodes": [one.as_json() for one in self.kept],
-            }
-            Path(self.args.report).write_text(json.dumps(report, indent=2) + "\n")
+        report = {
+            "out": str(self.recorder.root),
+            "robot": self._names,
+            "backend": self.robots[0].spec.driver,
+            "clock": self.rig.plan.clock,
+            "ended": ended,
+            "discarded": self.discarded,
+            "trips": self.display.report.trips,
+            "faults": self.display.report.faults,
+            "episodes": [one.as_json() for one in self.kept],
+        }
+        write_report(self.args.report, report)
         return sum(not one.failure for one in self.kept)
 
 

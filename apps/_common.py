@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import logging
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hal import registry
+from hal.apps._display import list_devices
+from hal.errors import CommandError, DeviceNotFound, HalError
 from hal.registry import ENGINES
+from hal.types import STREAMS
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
@@ -22,29 +28,6 @@ if TYPE_CHECKING:
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.specs import Plan
-
-__all__ = [
-    "ACTION_NEEDED",
-    "add_config_options",
-    "add_deadman_options",
-    "add_driving_options",
-    "add_episode_options",
-    "add_rig_options",
-    "check_driving_options",
-    "check_episode_options",
-    "check_everything",
-    "check_one_robot",
-    "check_report",
-    "config_options",
-    "find_deadman",
-    "interruptible",
-    "needs_deadman",
-    "resolve_plan",
-    "rig_options",
-    "robot_names",
-    "run_app",
-    "select_robots",
-]
 
 ACTION_NEEDED = 2
 """Exit status when the user has to fix something first."""
@@ -162,15 +145,32 @@ def add_episode_options(group: argparse._ArgumentGroup) -> None:
         metavar="MODULE:NAME",
         help="function of the rig and an observation; True ends an episode as a success",
     )
-    group.add_argument("--fps", type=int, default=30, metavar="N", help="frame rate of the recording (%(default)s)")
+    add_recording_options(group)
+
+
+def add_recording_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options of a program that records."""
+    group.add_argument(
+        "--fps", type=int, default=30, metavar="N", help="rows of the recording per second (%(default)s)"
+    )
     group.add_argument("--task", default="", metavar="TEXT", help="task, saved with each episode")
     group.add_argument("--report", metavar="FILE", help="write the results to a JSON file")
 
 
+def add_stream_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options that choose what is recorded."""
+    group.add_argument("--cameras", metavar="NAMES", help="cameras to record, or none (default: all)")
+    group.add_argument(
+        "--streams",
+        default="color,depth",
+        metavar="NAMES",
+        help=f"streams to record: {', '.join(STREAMS)}; objects: their poses as an observation (%(default)s)",
+    )
+    group.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")
+
+
 def check_episode_options(args: argparse.Namespace, *places: str) -> None:
     """Check the options of :func:`add_episode_options`, and import the functions that options name.
-
-    Modules are also looked for in the working directory.
 
     Args:
         args: The parsed options.
@@ -179,9 +179,6 @@ def check_episode_options(args: argparse.Namespace, *places: str) -> None:
     Raises:
         CommandError: A number is out of range, or a function cannot be imported.
     """
-    from hal.errors import CommandError
-    from hal.learning.policy import load_object
-
     for name in ("rate", "episodes", "seconds", "history"):
         if not getattr(args, name) > 0:
             raise CommandError(f"--{name} must be positive, not {getattr(args, name):g}")
@@ -189,18 +186,37 @@ def check_episode_options(args: argparse.Namespace, *places: str) -> None:
         raise CommandError(f"--seed must be 0 or more, not {args.seed}")
     check_one_robot(args)
     check_report(args.report)
+    for what in places:
+        load_named(args, what)
+
+
+def load_named(args: argparse.Namespace, option: str) -> Any:
+    """Return the object ``MODULE:NAME`` that an option names, also of a module in the working directory; else None.
+
+    Raises:
+        CommandError: It cannot be imported.
+    """
+    from hal.learning.policy import load_object
+
+    if not getattr(args, option):
+        return None
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
-    for what in places:
-        if getattr(args, what):
-            load_object(getattr(args, what), f"--{what}")
+    return load_object(getattr(args, option), f"--{option}")
 
 
-def rig_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments of :func:`hal.open` for the options of :func:`add_rig_options`."""
+def split_names(text: str | None) -> list[str] | None:
+    """Return the names of an option such as ``--cameras A,B``; none for ``none``, None if it is not given."""
+    if text is None:
+        return None
+    return [] if text == "none" else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def rig_options(args: argparse.Namespace, *, pad: bool = True) -> dict[str, Any]:
+    """Return the arguments of :func:`hal.open` for the options of :func:`add_rig_options`; without a pad on request."""
     return {
         **config_options(args),
-        "pad": args.pad,
+        "pad": args.pad if pad else "none",
         "viewer": args.viewer,
         "console": args.console or args.listen is not None,
         "listen": args.listen,
@@ -213,26 +229,23 @@ def rig_options(args: argparse.Namespace) -> dict[str, Any]:
 
 def resolve_plan(
     args: argparse.Namespace, *details: str, cameras: Iterable[str] = (), clock: str | None = None
-) -> Plan | None:
-    """Resolve the rig that the options name.
+) -> Plan:
+    """Return the rig that the options name; check its real arms before it is opened.
 
     Args:
         args: Options of :func:`add_rig_options`, and ``robot``.
         details: Further lines to print with ``--dry-run``.
         cameras: Names of cameras that must exist.
-        clock: ``real_time`` or ``lock_step``, whatever the rig file has; None for the rig's.
-
-    Returns:
-        The plan; None after ``--dry-run``, for which everything was checked and listed.
+        clock: ``lock_step``, whatever the rig file has, for a program in which nothing real moves; None for the rig's.
 
     Raises:
         ConfigError: The configuration is wrong.
         DeviceNotFound: There is no such robot or camera.
+        SystemExit: After ``--dry-run``, for which everything is checked and listed; or a check of a real arm failed.
     """
-    from hal.apps._display import list_devices
+    from hal.apps.check import may_open
     from hal.config import load
     from hal.config.files import suggest
-    from hal.errors import DeviceNotFound
 
     plan = load(**config_options(args), clock=clock).resolve()
     robots = [robot.name for robot in plan.robots]
@@ -243,19 +256,21 @@ def resolve_plan(
     for name in cameras:
         if name not in known:
             raise DeviceNotFound(f"--cameras: this rig has no camera {name!r}{suggest(name, known)}")
-    if not args.dry_run:
-        return plan
-    check_everything(plan, args)
-    notes = [*plan.warnings, *_world_warnings(plan)]
-    print(f"{plan.source} is valid; it would open:")
-    shown = replace(plan, pads=()) if args.pad == "none" else plan
-    print("\n".join(f"  {line}" for line in [*list_devices(shown), *(f"note     {note}" for note in notes), *details]))
-    return None
+    if args.dry_run:
+        check_everything(plan, args)
+        notes = [*plan.warnings, *_world_warnings(plan)]
+        print(f"{plan.source} is valid; it would open:")
+        shown = replace(plan, pads=()) if args.pad == "none" else plan
+        lines = [*list_devices(shown), *(f"note     {note}" for note in notes), *details]
+        print("\n".join(f"  {line}" for line in lines))
+        sys.exit(0)
+    if clock is None and not may_open(plan):
+        sys.exit(ACTION_NEEDED)
+    return plan
 
 
 def check_everything(plan: Plan, args: argparse.Namespace) -> None:
     """Raise the errors that opening the rig would raise, as far as they are known without a device or a process."""
-    from hal import registry
     from hal.rig import check_opening
     from hal.views import Listen
 
@@ -278,8 +293,6 @@ def _world_warnings(plan: Plan) -> list[str]:
     Raises:
         ConfigError: It cannot be loaded, or arms start inside each other.
     """
-    from hal import registry
-
     if plan.world is None:
         return []
     world = registry.load(plan.world.driver, "world")(plan.world)
@@ -298,15 +311,19 @@ def check_driving_options(args: argparse.Namespace) -> None:
         DeviceNotFound: There is no such pad.
     """
     from hal.config.mapping import load_mapping
-    from hal.errors import CommandError
     from hal.pads.choice import check_wanted
 
-    if args.speed is not None and not 0.0 < args.speed <= 1.0:
-        raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
+    check_speed(args)
     load_mapping(args.mapping or "default")
     if args.pad == "none":
         raise CommandError("--pad none: this program needs a gamepad")
     check_wanted(args.pad)
+
+
+def check_speed(args: argparse.Namespace) -> None:
+    """Check ``--speed``. Raises CommandError."""
+    if args.speed is not None and not 0.0 < args.speed <= 1.0:
+        raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
 
 
 def check_report(path: str | None) -> None:
@@ -315,8 +332,6 @@ def check_report(path: str | None) -> None:
     Raises:
         CommandError: It cannot.
     """
-    from hal.errors import CommandError
-
     if not path:
         return
     if os.path.isdir(path) or (os.path.exists(path) and not os.access(path, os.W_OK)):
@@ -326,10 +341,14 @@ def check_report(path: str | None) -> None:
         raise CommandError(f"--report {path}: the folder {folder} does not exist or cannot be written to")
 
 
+def write_report(path: str | None, report: Mapping[str, Any]) -> None:
+    """Write the file of ``--report``, if there is to be one."""
+    if path:
+        Path(path).write_text(json.dumps(report, indent=2) + "\n")
+
+
 def robot_names(args: argparse.Namespace) -> list[str]:
     """Return the names of ``--robot``. Raises CommandError if one is given twice."""
-    from hal.errors import CommandError
-
     names = [name.strip() for name in (args.robot or "").split(",") if name.strip()]
     if len(set(names)) < len(names):
         raise CommandError(f"--robot {args.robot}: an arm is named twice", code="duplicate_name")
@@ -342,8 +361,6 @@ def check_one_robot(args: argparse.Namespace) -> None:
     Raises:
         CommandError: It names several.
     """
-    from hal.errors import CommandError
-
     if len(robot_names(args)) > 1:
         message = f"--robot {args.robot}: this program moves one arm, and the others stand still; name one of them"
         raise CommandError(message, code="one_robot")
@@ -355,8 +372,6 @@ def select_robots(rig: Rig, args: argparse.Namespace) -> list[Robot]:
     Raises:
         CommandError: The rig has no robot.
     """
-    from hal.errors import CommandError
-
     names = robot_names(args) or list(rig.robots)[:1]
     if not names:
         raise CommandError(f"{rig.plan.source} has no robot to drive", code="no_robot")
@@ -368,14 +383,13 @@ def needs_deadman(plan: Plan, args: argparse.Namespace) -> bool:
     return bool(args.deadman) or (any(robot.attended for robot in plan.robots) and not args.unattended)
 
 
-def find_deadman(rig: Rig) -> tuple[Deadman, TeleopMapping]:
-    """Return the dead-man of the rig's pad, and the pad's mapping.
+def find_deadman(rig: Rig) -> tuple[Deadman, TeleopMapping, str]:
+    """Return the dead-man of the rig's pad, the pad's mapping, and the name of the dead-man's control.
 
     Raises:
         CommandError: The rig has no pad (code ``no_gamepad``), or its pad's controls cannot be held (``cannot_hold``).
     """
     from hal.config.mapping import load_mapping
-    from hal.errors import CommandError
 
     pad = next(iter(rig.gamepads.values()), None)
     if pad is None:
@@ -385,7 +399,7 @@ def find_deadman(rig: Rig) -> tuple[Deadman, TeleopMapping]:
         message = "keys of this terminal make one step for each press, and the dead-man must be held: use --pad web"
         raise CommandError(message, code="cannot_hold")
     mapping = load_mapping(pad.mapping or "default")
-    return pad.hold(mapping.deadman), mapping
+    return pad.hold(mapping.deadman), mapping, pad.control_name(mapping.deadman)
 
 
 # Running.
@@ -407,6 +421,19 @@ def interruptible() -> Iterator[None]:
             signal.signal(getattr(signal, name), handler)
 
 
+def program(parser: Callable[[], argparse.ArgumentParser]) -> Callable[[Callable[[Any], int]], Callable[..., int]]:
+    """Make a function of the parsed options one of the command line, without arguments of that of the process."""
+
+    def decorate(main: Callable[[Any], int]) -> Callable[..., int]:
+        @wraps(main)
+        def run(argv: list[str] | None = None) -> int:
+            return run_app(main, parser(), argv)
+
+        return run
+
+    return decorate
+
+
 def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) -> int:
     """Parse the command line and run ``main(args)``; an error that the user can fix is a message, not a traceback.
 
@@ -418,8 +445,6 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
     Returns:
         The exit status. The output is written by then, or known to be lost.
     """
-    from hal.errors import HalError
-
     _open_standard_streams()
     link = logging.getLogger("hal.console")
     before, link.disabled = link.disabled, True  # the banner prints the link
@@ -427,7 +452,10 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
         try:
             args = parser.parse_args(argv)
             with interruptible():
-                status = int(main(args))
+                try:
+                    status = int(main(args))
+                except SystemExit as end:  # of resolve_plan
+                    status = int(end.code or 0)
         finally:
             sys.stdout.flush()  # while what fails can still be reported
         return status

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 from urllib.parse import urlsplit
+
+from hal import registry
 
 if TYPE_CHECKING:
     from hal.rig import Rig
@@ -19,7 +19,11 @@ if TYPE_CHECKING:
     from hal.teleop import ArmTeleop
     from hal.types import RobotState
 
-__all__ = ["RunReport", "StatusLine", "TeleopDisplay", "banner", "list_devices", "list_links"]
+
+def count_episodes(count: int) -> str:
+    """Return a number of episodes in words."""
+    return f"{count} episode{'' if count == 1 else 's'}"
+
 
 # The banner.
 
@@ -69,8 +73,6 @@ def list_devices(plan: Plan) -> list[str]:
 
 def _missing_libraries(plan: Plan) -> dict[str, str]:
     """Return the libraries of arms and grippers that are not installed -> the command that installs each."""
-    from hal import registry
-
     devices = [device for robot in plan.robots for device in (robot, robot.gripper) if device is not None]
     return {name: command for one in devices for name, command in registry.find_missing(one.driver, one).items()}
 
@@ -134,13 +136,16 @@ def list_links(rig: Rig) -> str:
 # The live line.
 
 
+_PERIOD = 0.1
+"""Shortest time between two updates of the line, s."""
+
+
 class StatusLine:
     """A live line at the bottom of a terminal. Without a terminal only :meth:`event` prints."""
 
-    def __init__(self, stream: TextIO | None = None, period: float = 0.1) -> None:
+    def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = sys.stdout if stream is None else stream
         self._live = self._stream.isatty()
-        self._period = period
         self._next = 0.0
         self._drawn = False
 
@@ -149,7 +154,7 @@ class StatusLine:
         now = time.monotonic()
         if not self._live or now < self._next:
             return
-        self._next = now + self._period
+        self._next = now + _PERIOD
         width = shutil.get_terminal_size().columns - 1
         self._write("\r\x1b[K" + text()[:width])
         self._drawn = True
@@ -286,7 +291,7 @@ class RunReport:
             cameras[name] = {
                 "frames": counts.frames,
                 "fps": counts.fps,
-                "age_ms_p50": _ms(counts.age_p50),
+                "age_ms_p50": to_ms(counts.age_p50),
                 "dropped": counts.dropped,
             }
         report = {
@@ -317,20 +322,16 @@ class RunReport:
                 **{key: own[key] for key in ("reanchored", "lost", "skipped", "mismatches", "report_error")},
                 "driver": own["driver"],
             },
-            "latency_ms": {"p50": _ms(latency["p50"]), "p99": _ms(latency["p99"])},
+            "latency_ms": {"p50": to_ms(latency["p50"]), "p99": to_ms(latency["p99"])},
             "tcp_end": {"position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()},
             "peak": own["peak"],
         }
 
-    @staticmethod
-    def write(path: str, report: dict[str, Any]) -> None:
-        """Write a report that :meth:`collect` returned."""
-        Path(path).write_text(json.dumps(report, indent=2) + "\n")
 
-
-def _ms(seconds: float | None) -> float | None:
+def to_ms(seconds: float | None) -> float | None:
+    """Return a time in ms."""
     return None if seconds is None else 1e3 * seconds
 
 
 def _summary(summary: dict[str, float | None] | None) -> dict[str, float | None] | None:
-    return None if summary is None else {name: _ms(value) for name, value in summary.items()}
+    return None if summary is None else {name: to_ms(value) for name, value in summary.items()}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
+import hal
 from hal.apps._common import (
-    ACTION_NEEDED,
     add_rig_options,
     check_one_robot,
     resolve_plan,
@@ -14,6 +14,8 @@ from hal.apps._common import (
     robot_names,
     select_robots,
 )
+from hal.apps._display import banner, list_links
+from hal.errors import CommandError, MotionStopped, NotSupported
 
 if TYPE_CHECKING:
     from hal.deadman import Deadman
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
     from hal.gripper import Gripper, GripperResult
     from hal.rig import Rig
     from hal.specs import Plan, RobotSpec
-
-__all__ = ["find_zero", "gripper_parser"]
 
 LONGEST = 120.0
 """Time after which the search ends, s, however long the dead-man was held."""
@@ -47,18 +47,10 @@ def gripper_parser() -> argparse.ArgumentParser:
 
 def find_zero(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    import hal
-    from hal.apps._display import banner, list_links
-    from hal.apps.check import may_open
-
     check_one_robot(args)
     args.overrides = [*args.overrides, "cameras={}"]
     plan = resolve_plan(args)
-    if plan is None:
-        return 0
     spec, motor = _find_motor(plan, args)
-    if not may_open(plan):
-        return ACTION_NEEDED
     with hal.open(**rig_options(args)) as rig:
         print(f"{banner(rig)}\n{list_links(rig)}", flush=True)
         (robot,) = select_robots(rig, args)
@@ -84,8 +76,6 @@ def find_zero(args: argparse.Namespace) -> int:
 
 def _find_motor(plan: Plan, args: argparse.Namespace) -> tuple[RobotSpec, dict[str, Any]]:
     """Return the arm, and the settings of its gripper's motor. Raises NotSupported."""
-    from hal.errors import NotSupported
-
     name = next(iter(robot_names(args)), plan.robots[0].name)
     spec = next(robot for robot in plan.robots if robot.name == name)
     motor = None if spec.gripper is None else spec.gripper.options.get("motor")
@@ -103,7 +93,6 @@ def _find_deadman(rig: Rig, spec: RobotSpec) -> Deadman:
         NotSupported: It must not be the dead-man of a real gripper.
     """
     from hal.config.mapping import load_mapping
-    from hal.errors import CommandError
 
     pad: Gamepad | None = next(iter(rig.gamepads.values()), None)
     if pad is None:
@@ -126,7 +115,6 @@ def close_while_held(rig: Rig, gripper: Gripper, deadman: Deadman) -> GripperRes
     Raises:
         MotionStopped: The rig was stopped, or the search took longer than :data:`LONGEST`.
     """
-    from hal.errors import MotionStopped
     from hal.types import GripperOutcome
 
     clock, motion = rig.clock, None

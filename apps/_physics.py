@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["ALLOWED", "EXPERIMENTS", "Row", "run_experiments"]
-
 ALLOWED = 0.03
 """Greatest difference from theory, as a share of it."""
 G = 9.81

@@ -7,7 +7,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.apps._common import ACTION_NEEDED, add_deadman_options, add_rig_options, rig_options
+import hal
+from hal.apps._common import (
+    add_deadman_options,
+    add_rig_options,
+    check_one_robot,
+    check_report,
+    check_speed,
+    find_deadman,
+    needs_deadman,
+    resolve_plan,
+    rig_options,
+    select_robots,
+)
+from hal.apps._display import banner, list_links
+from hal.errors import CommandError, ConnectionLost, MotionStopped, RobotFault
 
 if TYPE_CHECKING:
     from hal.camera import Camera
@@ -16,8 +30,6 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from hal.skills import LocatedObject, SkillProgress, SkillResult
     from hal.types import Frame
-
-__all__ = ["FAILED", "SkillApp", "add_skill_options", "run_skill"]
 
 FAILED = 1
 """Exit status if the skill did not succeed."""
@@ -49,29 +61,17 @@ def run_skill(args: argparse.Namespace, what: str, act: Callable[[SkillApp], Ski
     Returns:
         The exit status.
     """
-    import hal
-    from hal.apps._common import check_one_robot, check_report, find_deadman, needs_deadman, resolve_plan, select_robots
-    from hal.apps._display import banner, list_links
-    from hal.apps.check import may_open
-    from hal.errors import CommandError, ConnectionLost, MotionStopped, RobotFault
-
-    if args.speed is not None and not 0.0 < args.speed <= 1.0:
-        raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
+    check_speed(args)
     check_one_robot(args)
     check_report(args.picture)
     plan = resolve_plan(args, what, cameras=[args.camera] if args.camera else [])
-    if plan is None:
-        return 0
-    if not may_open(plan):
-        return ACTION_NEEDED
     holds = needs_deadman(plan, args)
-    with hal.open(**{**rig_options(args), "pad": args.pad if holds else "none"}) as rig:
+    with hal.open(**rig_options(args, pad=holds)) as rig:
         (robot,) = select_robots(rig, args)
         print(f"{banner(rig)}\n  {what}\n{list_links(rig)}", flush=True)
         app = SkillApp(rig, robot, args)
         if holds:
-            app.motion["deadman"], mapping = find_deadman(rig)
-            button = next(iter(rig.gamepads.values())).control_name(mapping.deadman)
+            app.motion["deadman"], _, button = find_deadman(rig)
             app.print(f"hold {button} until the arm is done")
         app.motion["unattended"] = args.unattended or not holds
         try:
@@ -127,7 +127,6 @@ class SkillApp:
         Raises:
             CommandError: No camera has depth, and none is named.
         """
-        from hal.errors import CommandError
         from hal.skills.depth import is_on_hand
 
         if self.args.camera:

@@ -13,8 +13,11 @@ import math
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import ACTION_NEEDED, add_rig_options, rig_options, run_app
+import hal
+from hal.apps._common import ACTION_NEEDED, add_rig_options, check_everything, config_options, rig_options, run_app
+from hal.apps._display import banner, list_devices, list_links
 from hal.apps._gripper_zero import find_zero, gripper_parser
+from hal.errors import CommandError
 
 if TYPE_CHECKING:
     from hal.calibration import Board, Calibration, CalibrationSetup, Collector, RigFileOutput
@@ -106,14 +109,10 @@ def _print_board(args: argparse.Namespace) -> int:
 
 
 def _main(args: argparse.Namespace) -> int:
-    import hal
     from hal import calibration
-    from hal.apps._common import check_everything, config_options
-    from hal.apps._display import banner, list_devices, list_links
     from hal.apps.check import may_open
     from hal.config import load
     from hal.config.mapping import load_mapping
-    from hal.errors import CommandError
     from hal.pads.choice import check_wanted
 
     if args.views < calibration.LEAST_VIEWS:
@@ -152,7 +151,6 @@ def _main(args: argparse.Namespace) -> int:
 
 def _collect(args: argparse.Namespace, rig: Rig, collector: Collector, guess: Pose | None) -> None:
     """Take the views: automatically with a guess, else by hand."""
-    import hal
     from hal.calibration import ManualDrive, add_view, collect_views, wait_for_enter
 
     def report(text: str) -> None:

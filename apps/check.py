@@ -17,7 +17,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, TextIO
 
-from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, run_app
+from hal import registry
+from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, program
+from hal.errors import CommandError, HalError
 
 if TYPE_CHECKING:
     from hal.gamepad import Gamepad
@@ -25,20 +27,11 @@ if TYPE_CHECKING:
     from hal.specs import PadSpec, Plan
     from hal.types import PadState
 
-__all__ = [
-    "main",
-    "may_open",
-    "parser",
-]
-
 # --cameras: the cameras that are plugged in, with the keys that select each of them in a rig file.
 
 
 def show_cameras() -> bool:
     """Print the cameras that every driver finds; return whether there are any."""
-    from hal import registry
-    from hal.errors import HalError
-
     found = False
     for name in registry.names():
         try:
@@ -67,9 +60,6 @@ def show_cameras() -> bool:
 
 def show_can() -> bool:
     """Print the CAN interfaces and adapters that the drivers find; return whether there are any."""
-    from hal import registry
-    from hal.errors import HalError
-
     found = failed = False
     drivers: dict[str, list[str]] = {}
     for name in registry.BUILT_IN:
@@ -141,8 +131,6 @@ class _PadMonitor:
     """The pads that are shown: all that are plugged in, or those of a rig."""
 
     def __init__(self, specs: Sequence[PadSpec]) -> None:
-        from hal import registry
-
         self._driver = registry.load("evdev", "gamepad")
         self._specs = [replace(spec, driver="evdev") for spec in specs if spec.driver in _REAL]
         self._skipped = [spec for spec in specs if spec.driver not in _REAL]
@@ -342,8 +330,6 @@ def _bar(value: float) -> str:
 
 def check_physics(engine: str, as_json: bool) -> bool:
     """Run the experiments of :mod:`._physics` on an engine and print them; return whether all agree with theory."""
-    from hal import registry
-
     from ._physics import ALLOWED, run_experiments
 
     engine = registry.choose_engine(engine)
@@ -408,14 +394,10 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.config import load
-    from hal.errors import CommandError
     from hal.preflight import list_checked_cameras, list_real_arms, preflight
 
     if args.pads:
@@ -442,8 +424,6 @@ def _main(args: argparse.Namespace) -> int:
 
 
 def _physics(args: argparse.Namespace) -> int:
-    from hal.errors import CommandError
-
     others = [args.overrides, args.sim is False, args.config != parser().get_default("config"), args.duration]
     if any(others):
         raise CommandError("--physics has rigs of its own: it takes --engine and --json, and no other option")
@@ -452,7 +432,6 @@ def _physics(args: argparse.Namespace) -> int:
 
 def _pads(args: argparse.Namespace) -> int:
     from hal.config import load
-    from hal.errors import CommandError
 
     if args.json:
         raise CommandError("--json cannot be used with --pads, which runs until Ctrl-C")

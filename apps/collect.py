@@ -7,20 +7,32 @@ hal collect --real --config my_rig.yaml --episodes 10 --task "lift the cube" --o
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hal.apps._common import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
-from hal.types import STREAMS
+import hal
+from hal.apps._common import (
+    add_driving_options,
+    add_recording_options,
+    add_rig_options,
+    add_stream_options,
+    check_driving_options,
+    check_report,
+    load_named,
+    program,
+    resolve_plan,
+    rig_options,
+    select_robots,
+    split_names,
+)
+from hal.apps._display import banner
+from hal.errors import CommandError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from hal.robot import Robot
-
-__all__ = ["main", "parser"]
 
 DEMO_MISPLACED = (
     "--pad demo reaches for the places that --seed 0 gives the cube in the first two episodes of a new folder; here "
@@ -50,37 +62,20 @@ def parser() -> argparse.ArgumentParser:
     what = made.add_argument_group("collecting")
     what.add_argument("--out", default="demonstrations", metavar="DIR", help="dataset to add to (%(default)s)")
     what.add_argument("--episodes", type=int, default=10, metavar="N", help="number of episodes (%(default)s)")
-    what.add_argument("--task", default="", metavar="TEXT", help="task, saved with each episode")
-    what.add_argument("--fps", type=int, default=30, metavar="N", help="frame rate, rows per second (%(default)s)")
+    add_recording_options(what)
     what.add_argument("--seed", type=int, default=0, metavar="N", help="object placement seed (%(default)s)")
-    what.add_argument("--cameras", metavar="NAMES", help="cameras to record, separated by commas (default: all)")
-    what.add_argument(
-        "--streams",
-        default="color,depth",
-        metavar="NAMES",
-        help=f"streams to record: {', '.join(STREAMS)}; objects: their poses as an observation (%(default)s)",
-    )
+    add_stream_options(what)
     what.add_argument("--no-depth", dest="depth", action="store_false", help="do not record depth")
-    what.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")
     what.add_argument(
         "--success",
         metavar="MODULE:NAME",
         help="function of the rig and an observation that confirms a success; False saves the episode as a failure",
     )
-    what.add_argument("--report", metavar="FILE", help="write the results to a JSON file")
     return made
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run ``collect``; return the exit status."""
-    return run_app(_main, parser(), argv)
 
 
 def _check_options(args: argparse.Namespace) -> None:
     """Check the options that need no rig. Raises CommandError, ConfigError or DeviceNotFound."""
-    from hal.apps._common import check_driving_options, check_report
-    from hal.errors import CommandError
-
     check_driving_options(args)
     for name, least in (("episodes", 1), ("seed", 0), ("fps", 1)):
         if getattr(args, name) < least:
@@ -90,29 +85,20 @@ def _check_options(args: argparse.Namespace) -> None:
     check_report(args.report)
 
 
-def _main(args: argparse.Namespace) -> int:
-    import hal
+@program(parser)
+def main(args: argparse.Namespace) -> int:
+    """Run ``collect``; return the exit status."""
     from hal.apps._collecting import CollectRun, lifts_cube
-    from hal.apps._common import resolve_plan, select_robots
-    from hal.apps._display import banner
-    from hal.apps.check import may_open
     from hal.config.data_files import data_folder
-    from hal.learning.policy import load_object
     from hal.recording import Recorder, recover
     from hal.recording.layout import require_libraries
 
     _check_options(args)
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    judge = load_object(args.success, "--success") if args.success else None
-    cameras = None if args.cameras is None else [name.strip() for name in args.cameras.split(",") if name.strip()]
+    judge = load_named(args, "success")
+    cameras = split_names(args.cameras)
     dataset = f"dataset  {args.out}: {args.episodes} episode(s) at {args.fps} rows/s"
-    plan = resolve_plan(args, dataset, cameras=cameras or ())
     require_libraries()
-    if plan is None:
-        return 0
-    if not may_open(plan):
-        return ACTION_NEEDED
+    plan = resolve_plan(args, dataset, cameras=cameras or ())
     options = rig_options(args)
     demo = args.pad == "demo" or (args.pad == "auto" and plan.clock == "lock_step")  # the tour records nothing
     if demo:
@@ -121,10 +107,8 @@ def _main(args: argparse.Namespace) -> int:
         print(banner(rig), flush=True)
         robots = select_robots(rig, args)
         recovered = recover(args.out) if Path(args.out).is_dir() else []
-        streams = [name.strip() for name in args.streams.split(",")]
-        with Recorder(
-            rig, args.out, args.fps, args.task, args.depth, cameras=cameras, streams=streams, codec=args.codec
-        ) as recorder:
+        chosen = {"cameras": cameras, "streams": split_names(args.streams), "codec": args.codec}
+        with Recorder(rig, args.out, args.fps, args.task, args.depth, **chosen) as recorder:
             notes = [*recovered, *recorder.notes]
             if demo:
                 judge = judge or lifts_cube(rig, robots[0])

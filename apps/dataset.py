@@ -14,15 +14,14 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app
+from hal.apps._common import program
+from hal.apps._display import StatusLine, count_episodes
 from hal.errors import CommandError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hal.recording import Dataset, Episode
-
-__all__ = ["main", "parser"]
 
 MARKS: dict[str, bool | None] = {"success": True, "failure": False, "none": None}
 PARTS = {True: "success", False: "failure", None: "unmarked"}
@@ -98,25 +97,22 @@ def _add_trim_options(trimming: argparse.ArgumentParser) -> None:
     add("--yes", action="store_true", help="do not ask")
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.recording import Dataset, delete_episodes, extract, mark_episodes, merge, pack, set_task, split
     from hal.recording.exporters.content import select_episodes
 
     if args.command == "merge":
         count = merge(args.datasets, args.out, on_episode=_progress())
-        print(f"{args.out}: {_many(count)}")
+        print(f"{args.out}: {count_episodes(count)}")
         return 0
     if args.command in ("check", "repair"):
         from hal.apps import review
 
         return review.main([args.dataset, f"--{args.command}"])
     if args.command == "pack":
-        print(f"{args.dataset}: {_many(pack(args.dataset))}, joined")
+        print(f"{args.dataset}: {count_episodes(pack(args.dataset))}, joined")
         return 0
     dataset = Dataset(args.dataset)
     if args.command == "list":
@@ -124,21 +120,21 @@ def _main(args: argparse.Namespace) -> int:
         return 0
     if args.command == "split":
         for name, count in split(dataset, _parts(dataset, args), args.out).items():
-            print(f"{args.out}/{name}: {_many(count)}")
+            print(f"{args.out}/{name}: {count_episodes(count)}")
         return 0
     chosen = [episode.number for episode in select_episodes(dataset, args.episodes, successful_only=False)]
     if args.command == "extract":
-        print(f"{args.out}: {_many(extract(dataset, chosen, args.out))}")
+        print(f"{args.out}: {count_episodes(extract(dataset, chosen, args.out))}")
     elif args.command == "mark":
         mark_episodes(dataset, dict.fromkeys(chosen, MARKS[args.mark]))
-        print(f"{_many(len(chosen))} of {dataset.root}: {args.mark}")
+        print(f"{count_episodes(len(chosen))} of {dataset.root}: {args.mark}")
     elif args.command == "task":
         set_task(dataset, args.task, chosen)
-        print(f"{_many(len(chosen))} of {dataset.root}: {args.task}")
+        print(f"{count_episodes(len(chosen))} of {dataset.root}: {args.task}")
     elif args.command == "trim":
         _trim(dataset, chosen, args)
-    elif args.yes or _confirmed(f"delete {len(chosen)} of {_many(len(dataset))} of {dataset.root}, for good?"):
-        print(f"{dataset.root}: {_many(delete_episodes(dataset, chosen))} left")
+    elif args.yes or _confirmed(f"delete {len(chosen)} of {count_episodes(len(dataset))} of {dataset.root}, for good?"):
+        print(f"{dataset.root}: {count_episodes(delete_episodes(dataset, chosen))} left")
     else:
         print("nothing was deleted")
     return 0
@@ -179,7 +175,7 @@ def _trim(dataset: Dataset, chosen: list[int], args: argparse.Namespace) -> None
             kept[number], before, after = rows, before + start, after + end
             times = f"{start / episode.fps:.2f} s at the start, {end / episode.fps:.2f} s at the end"
             print(f"episode {number}: {start + end} of {episode.length} rows, {times}")
-    total = f"{before + after} rows of {_many(len(kept))}"
+    total = f"{before + after} rows of {count_episodes(len(kept))}"
     if args.dry_run or not kept:
         print(f"{total} would be removed" if kept else "nothing to trim")
     elif args.out or args.yes or _confirmed(f"remove {total} of {dataset.root}, for good?"):
@@ -199,7 +195,7 @@ def _list(dataset: Dataset, args: argparse.Namespace) -> None:
         dropped = episode.info["dropped"] or 0
         end = f"{NAMES[episode.success]:8}  {dropped:7d}  {episode.task}"
         print(f"{episode.number:7d}  {episode.length / episode.fps:7.2f}  {end}")
-    print(f"{len(found)} of {_many(len(dataset))} of {dataset.root}")
+    print(f"{len(found)} of {count_episodes(len(dataset))} of {dataset.root}")
     for note in dataset.notes:
         print(f"note: {note}")
 
@@ -222,8 +218,6 @@ def _confirmed(question: str) -> bool:
 
 
 def _progress() -> Callable[[int, int], None]:
-    from hal.apps._display import StatusLine
-
     line = StatusLine()
 
     def show(done: int, total: int) -> None:
@@ -232,10 +226,6 @@ def _progress() -> Callable[[int, int], None]:
             line.clear()
 
     return show
-
-
-def _many(count: int) -> str:
-    return f"{count} episode{'' if count == 1 else 's'}"
 
 
 if __name__ == "__main__":

@@ -10,19 +10,15 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app
+from hal.apps._common import program, split_names
+from hal.apps._display import StatusLine, count_episodes
+from hal.errors import CommandError
 
 if TYPE_CHECKING:
     from hal.recording.exporters import ExportProgress
-
-__all__ = ["main", "parser"]
-
-_PROGRESS_PERIOD = 0.1
-"""s between two updates of the progress on a terminal."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -74,12 +70,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.recording.exporters import export
 
     made = export(
@@ -88,7 +81,7 @@ def _main(args: argparse.Namespace) -> int:
         args.out,
         episodes=args.episodes,
         successful_only=args.successful_only,
-        cameras=_names(args.cameras),
+        cameras=split_names(args.cameras),
         depth=args.depth,
         size=_size(args.resize),
         camera=args.camera,
@@ -97,24 +90,15 @@ def _main(args: argparse.Namespace) -> int:
         action=args.action,
         rotation=args.rotation,
         force=args.force,
-        progress=_show_progress() if sys.stderr.isatty() else None,
+        progress=_show_progress(),
     )
     for note in made.notes:
         print(f"note: {note}")
-    many = f"{made.episodes} episode{'' if made.episodes == 1 else 's'}"
-    print(f"wrote {made.path}: {many}, {made.rows} rows, {made.size / 1e6:.1f} MB")
+    print(f"wrote {made.path}: {count_episodes(made.episodes)}, {made.rows} rows, {made.size / 1e6:.1f} MB")
     return 0
 
 
-def _names(text: str | None) -> list[str] | None:
-    if text is None:
-        return None
-    return [] if text == "none" else [name.strip() for name in text.split(",")]
-
-
 def _size(text: str | None) -> tuple[int, int] | None:
-    from hal.errors import CommandError
-
     if text is None:
         return None
     match = re.fullmatch(r"(\d+)x(\d+)", text)
@@ -125,15 +109,12 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def _show_progress() -> Callable[[ExportProgress], None]:
     """Return a function that shows the progress in one line of the terminal."""
-    last = 0.0
+    line = StatusLine(sys.stderr)
 
     def show(progress: ExportProgress) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last > _PROGRESS_PERIOD or progress.share >= 1.0:
-            last = now
-            end = "\n" if progress.share >= 1.0 else ""
-            print(f"\r{100 * progress.share:3.0f} %  episode {progress.episode}", end=end, file=sys.stderr, flush=True)
+        line.update(lambda: f"{100 * progress.share:3.0f} %  episode {progress.episode}")
+        if progress.share >= 1.0:
+            line.clear()
 
     return show
 

@@ -18,17 +18,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.apps._common import add_config_options, add_episode_options, config_options, run_app
-from hal.types import STREAMS
+from hal import registry
+from hal.apps._common import (
+    add_config_options,
+    add_episode_options,
+    add_stream_options,
+    check_episode_options,
+    config_options,
+    program,
+    resolve_plan,
+    split_names,
+    write_report,
+)
+from hal.apps._display import StatusLine, list_devices
+from hal.errors import CommandError, ConfigError, HalError
 
 if TYPE_CHECKING:
-    from hal.apps._display import StatusLine
-    from hal.errors import ConfigError, HalError
     from hal.learning.episode_worker import EpisodeRecipe, EpisodeResult
     from hal.learning.generate import GenerateProgress
     from hal.specs import Plan
-
-__all__ = ["main", "parser"]
 
 _PERIOD = 10.0
 """Time between two lines of progress if the output is not a terminal, s."""
@@ -67,14 +75,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add_episode_options(run)
     run.add_argument("--out", required=True, metavar="DIR", help="dataset to generate")
-    run.add_argument("--cameras", metavar="NAMES", help="cameras to record, or none (default: all)")
-    run.add_argument(
-        "--streams",
-        default="color,depth",
-        metavar="NAMES",
-        help=f"streams to record: {', '.join(STREAMS)}; objects: their poses as an observation (%(default)s)",
-    )
-    run.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")
+    add_stream_options(run)
     where = made.add_argument_group("workers")
     where.add_argument("--workers", type=int, default=1, metavar="N", help="number of workers (%(default)s)")
     where.add_argument(
@@ -98,37 +99,28 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
-    from hal import registry
-    from hal.apps._common import check_episode_options, resolve_plan
-    from hal.apps._display import StatusLine, list_devices
-    from hal.errors import ConfigError
     from hal.learning.generate import LocalWorker, StartWorker, generate, parts_folder
     from hal.recording.layout import require_libraries
 
     check_episode_options(args, "policy", "skill", "reset", "success")
     runtime_env = _check_workers(args)
     args.pad, args.viewer, args.console, args.listen = "none", "none", False, None
-    cameras = _names(args.cameras)
+    cameras = split_names(args.cameras)
     where = f"the Ray cluster {args.ray}" if args.ray else "this computer"
     details = (
         f"{'skill ' if args.skill else 'policy'}   {args.skill or args.policy}",
         f"dataset  {args.out}: {args.episodes} episode(s), {args.workers} worker(s) on {where}",
     )
+    require_libraries()
     try:
         plan = resolve_plan(args, *details, cameras=cameras or (), clock="lock_step")
     except ConfigError as error:
         raise _without_real_devices(error, args) from None
-    require_libraries()
-    if plan is None:
-        return 0
     _check_plan(plan)
     if plan.engine is not None:
         registry.check_engine(plan.engine)
@@ -172,7 +164,6 @@ def _check_workers(args: argparse.Namespace) -> dict[str, Any]:
     """
     import yaml
 
-    from hal.errors import CommandError
     from hal.learning.uploads import is_address
 
     if args.workers < 1:
@@ -194,16 +185,8 @@ def _check_workers(args: argparse.Namespace) -> dict[str, Any]:
     return found
 
 
-def _names(text: str | None) -> list[str] | None:
-    if text is None:
-        return None
-    return [] if text == "none" else [name.strip() for name in text.split(",") if name.strip()]
-
-
 def _without_real_devices(error: ConfigError, args: argparse.Namespace) -> HalError:
     """Return the error for this program, in which nothing else than a simulation would help against real devices."""
-    from hal.errors import CommandError
-
     if {problem.code for problem in error.problems} - {"real_in_lock_step", "emulated_in_lock_step"}:
         return error
     real = ", ".join(problem.key for problem in error.problems)
@@ -214,8 +197,6 @@ def _without_real_devices(error: ConfigError, args: argparse.Namespace) -> HalEr
 
 def _check_plan(plan: Plan) -> None:
     """Raise CommandError for a rig that cannot run in lock-step, without anyone present."""
-    from hal.errors import CommandError
-
     if plan.attended:
         raise CommandError(
             f"{plan.source} has a real arm; episodes are generated in simulation only: add --sim", code="attended"
@@ -244,7 +225,7 @@ def _recipe(args: argparse.Namespace, plan: Plan, cameras: list[str] | None) -> 
         fps=args.fps,
         task=args.task,
         cameras=cameras,
-        streams=_names(args.streams) or [],
+        streams=split_names(args.streams) or [],
         codec=args.codec,
         plan=hashlib.sha256(json.dumps(resolved, sort_keys=True, default=str).encode()).hexdigest()[:16],
     )
@@ -293,15 +274,14 @@ def _print_results(args: argparse.Namespace, made: list[EpisodeResult]) -> None:
     print(f"  {dataset.root}: {len(marks)} episodes{new}, {dataset.info['total_frames']} rows{rate}")
     for reason, count in Counter(result.reason for result in made if result.reason).most_common(5):
         print(f"    {count} stopped: {reason}")
-    if args.report:
-        report: dict[str, Any] = {
-            "out": str(dataset.root),
-            "workers": args.workers,
-            "episodes": len(marks),
-            "succeeded": sum(judged),
-            "made": [vars(result) for result in made],
-        }
-        Path(args.report).write_text(json.dumps(report, indent=2) + "\n")
+    report = {
+        "out": str(dataset.root),
+        "workers": args.workers,
+        "episodes": len(marks),
+        "succeeded": sum(judged),
+        "made": [vars(result) for result in made],
+    }
+    write_report(args.report, report)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,9 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app
+from hal.apps._common import program
 from hal.apps._skills import SkillApp, add_skill_options, run_skill
+from hal.errors import NotSupported
 
 if TYPE_CHECKING:
     from hal.skills import SkillResult
@@ -33,19 +34,15 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     how = "gently" if args.gentle else "firmly"
     return run_skill(args, f"grasp    {args.object or 'the largest object in sight'}, {how}", _grasp)
 
 
 def _grasp(app: SkillApp) -> SkillResult | None:
     """Find the object and grasp it."""
-    from hal.errors import NotSupported
     from hal.skills import gentle_grasp, grasp, grasp_pose
 
     arm, args = app.robot, app.args

@@ -20,9 +20,9 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from hal.apps._common import run_app
-
-__all__ = ["BESIDE", "GROUP", "PROGRAMS", "main", "parser"]
+import hal
+from hal.apps._common import program
+from hal.errors import CommandError, DriverMissing
 
 PROGRAMS = {
     "teleop": "drive an arm: page in a browser, gamepad, terminal, recorded tour",
@@ -74,14 +74,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
-    import hal
-
     if args.version:
         print(f"robot-hal {hal.__version__}")
     elif args.command == "list":
@@ -110,7 +105,6 @@ def _find_program(name: str) -> Callable[[list[str]], int]:
     from importlib.metadata import entry_points  # slow to import, so only when it is needed
 
     from hal.config.files import suggest
-    from hal.errors import CommandError, DriverMissing
 
     for point in entry_points(group=GROUP, name=name):
         loaded: Callable[[list[str]], int] = point.load()

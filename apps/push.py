@@ -10,7 +10,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import run_app
+from hal.apps._common import program
 from hal.apps._skills import SkillApp, add_skill_options, run_skill
 
 if TYPE_CHECKING:
@@ -42,12 +42,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     return run_skill(args, f"push     {args.object or 'the largest object in sight'}", _push)
 
 

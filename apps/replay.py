@@ -7,12 +7,25 @@ hal replay data/demo --episode 0 --speed 0.5 --real --config my_rig.yaml
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.apps._common import ACTION_NEEDED, add_deadman_options, add_rig_options, rig_options, run_app
+import hal
+from hal.apps._common import (
+    add_deadman_options,
+    add_rig_options,
+    check_one_robot,
+    check_report,
+    check_speed,
+    find_deadman,
+    needs_deadman,
+    program,
+    resolve_plan,
+    rig_options,
+    write_report,
+)
+from hal.apps._display import StatusLine, banner, list_links
+from hal.errors import CommandError, ConnectionLost, DatasetError, HalError, MotionStopped, RobotFault, StaleStateError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,22 +64,13 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
-    import hal
-    from hal.apps._common import check_one_robot, check_report, find_deadman, needs_deadman, resolve_plan
-    from hal.apps._display import banner, list_links
-    from hal.apps.check import may_open
-    from hal.errors import CommandError
     from hal.recording import Dataset
     from hal.recording.checking import check_rows
 
-    if not 0.0 < args.speed <= 1.0:
-        raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
+    check_speed(args)
     check_one_robot(args)
     check_report(args.report)
     episodes = Dataset(args.dataset).episodes
@@ -76,20 +80,13 @@ def _main(args: argparse.Namespace) -> int:
     check_rows(episode, None)  # before anything is opened
     what = f"episode  {episode.number}: {episode.length} rows at {episode.fps:g} Hz, {episode.task or 'no task'!r}"
     plan = resolve_plan(args, what)
-    if plan is None:
-        return 0
-    if not may_open(plan):
-        return ACTION_NEEDED
     holds = needs_deadman(plan, args)
-    with hal.open(**{**rig_options(args), "pad": args.pad if holds else "none"}) as rig:
+    with hal.open(**rig_options(args, pad=holds)) as rig:
         if not rig.robots:
             raise CommandError(f"{rig.plan.source} has no robot", code="no_robot")
         robot = rig.robots[args.robot or _driven(rig, episode)]
         print("\n  ".join([banner(rig), what, *_replayed(robot, episode)]) + f"\n{list_links(rig)}", flush=True)
-        deadman, button = None, ""
-        if holds:
-            deadman, mapping = find_deadman(rig)
-            button = next(iter(rig.gamepads.values())).control_name(mapping.deadman)
+        deadman, _, button = find_deadman(rig) if holds else (None, None, "")
         return ReplayRun(rig, robot, episode, args, deadman, button).run()
 
 
@@ -106,7 +103,6 @@ def _driven(rig: Rig, episode: Episode) -> str:
 
 def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
     """Yield lines for the banner: the arm, other arms that moved in the recording, and damaged images."""
-    from hal.errors import DatasetError
     from hal.learning.replay import list_other_arms
     from hal.recording.layout import GRIP_FORCE
 
@@ -130,7 +126,6 @@ class ReplayRun:
         self, rig: Rig, robot: Robot, episode: Episode, args: argparse.Namespace, deadman: Deadman | None, button: str
     ) -> None:
         """Check the episode against the arm. ``button`` is the name of the dead-man's control; empty without one."""
-        from hal.apps._display import StatusLine
         from hal.learning.replay import RecordedTrajectory, TrajectoryPlayer
 
         self.rig, self.robot, self.episode, self.args, self.button = rig, robot, episode, args, button
@@ -149,8 +144,6 @@ class ReplayRun:
 
     def run(self) -> int:
         """Move to the first pose, replay, report. Return the exit status."""
-        from hal.errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
-
         reason = ""
         try:
             self._play()
@@ -161,15 +154,11 @@ class ReplayRun:
         self.line.clear()
         ticks, missed = self._missed()
         self._print_results(reason, ticks, missed)
-        if self.args.report:
-            report = self._report(reason) | {"servo": {"ticks": ticks, "missed": missed}}
-            Path(self.args.report).write_text(json.dumps(report, indent=2) + "\n")
+        write_report(self.args.report, self._report(reason) | {"servo": {"ticks": ticks, "missed": missed}})
         return 0 if self.player.finished else NOT_FINISHED
 
     def _missed(self) -> tuple[int, int]:
         """Return the ticks during the replay and the missed ones; zeros if the arm's process is gone."""
-        from hal.errors import HalError
-
         try:
             now = self._servo()
         except (HalError, OSError):

@@ -15,7 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hal.apps._common import ACTION_NEEDED, run_app
+from hal.apps._common import ACTION_NEEDED, program
+from hal.apps._display import count_episodes
 from hal.errors import CommandError, DatasetError
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
     from hal.recording.dataset import Dataset, Episode
     from hal.recording.review import ColumnSpread, DatasetSummary
-
-__all__ = ["main", "parser"]
 
 LEAVE_OUT = (
     "restore the files of a damaged episode from a copy, or leave it out with hal export --episodes; "
@@ -67,12 +66,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.recording import Dataset
     from hal.recording.exporters.content import select_episodes
     from hal.recording.review import summarize, summary_as_json
@@ -115,7 +111,7 @@ def _check(args: argparse.Namespace, dataset: Dataset) -> int:
         print(json.dumps({"path": str(dataset.root), "episodes": count, "wrong": found}, indent=2))
     else:
         remedy = f"; next: {repair_command(DatasetLayout(dataset.root))}" if found else ""
-        end = f"{count} episode{'' if count == 1 else 's'} checked, {len(found)} problem(s){remedy}"
+        end = f"{count_episodes(count)} checked, {len(found)} problem(s){remedy}"
         print("\n".join([*found, end]))
     return ACTION_NEEDED if found else 0
 
@@ -179,8 +175,7 @@ def _table(found: DatasetSummary) -> Iterator[str]:
     """Yield the statistics, line by line."""
     from hal.recording.metadata import SLOW_PACE
 
-    count = len(found.episodes)
-    many = f"{count} episode{'' if count == 1 else 's'}"
+    many = count_episodes(len(found.episodes))
     yield f"{found.path}: {many} of {found.robot_type}, {found.rows} rows at {found.fps} Hz, {found.seconds:.1f} s"
     marked = found.successes + found.failures
     share = f" ({100 * found.successes / marked:.0f} % of those marked)" if marked else ""

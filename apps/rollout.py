@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import queue
 import subprocess
@@ -18,22 +17,29 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import hal
 from hal.apps._common import (
     ACTION_NEEDED,
     add_deadman_options,
     add_episode_options,
     add_rig_options,
+    check_episode_options,
+    find_deadman,
+    load_named,
+    needs_deadman,
+    program,
+    resolve_plan,
     rig_options,
-    run_app,
+    write_report,
 )
+from hal.apps._display import StatusLine, banner, list_links, to_ms
+from hal.errors import CommandError, HalError, MotionStopped, PolicyError, RobotFault
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    import hal
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.gamepad import Gamepad
@@ -112,43 +118,31 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
-    import hal
-    from hal.apps._common import check_episode_options, find_deadman, needs_deadman, resolve_plan
-    from hal.apps._display import banner, list_links
-    from hal.apps.check import may_open
-    from hal.errors import CommandError
     from hal.learning.policy_config import load_policy_config
 
     remote = is_remote(args.policy)
     check_episode_options(args, *([] if remote else ["policy"]), "reset", "success")
     if args.policy_config and not remote:
         raise CommandError("--policy-config is for a policy on a server: --policy ws://HOST:PORT")
+    if args.takeover and args.unattended:
+        raise CommandError("--takeover needs a pad and its dead-man; leave --unattended out")
     config = load_policy_config(args.policy_config) if args.policy_config else None
     make_controller(args.controller)  # so that a mistake shows before anything is opened
     plan = resolve_plan(args, f"policy   {args.policy}")
-    if plan is None:
-        return 0
-    if not may_open(plan):
-        return ACTION_NEEDED
-    if args.takeover and args.unattended:
-        raise CommandError("--takeover needs a pad and its dead-man; leave --unattended out")
     holds = args.takeover or needs_deadman(plan, args)
-    with hal.open(**{**rig_options(args), "pad": args.pad if holds else "none"}) as rig:
+    with hal.open(**rig_options(args, pad=holds)) as rig:
         if not rig.robots:
             raise CommandError(f"{rig.plan.source} has no robot", code="no_robot")
         robot = rig.robots[args.robot or next(iter(rig.robots))]
         print(f"{banner(rig)}\n  policy   {args.policy}\n{list_links(rig)}", flush=True)
-        deadman, mapping = find_deadman(rig) if holds else (None, None)
+        held = find_deadman(rig) if holds else (None, None, "")
         recorder = _recorder(rig, args)
         try:
             with _policy(rig, robot, args, config) as policy:
-                return RolloutRun(rig, robot, args, policy, recorder, deadman, mapping).run()
+                return RolloutRun(rig, robot, args, policy, recorder, *held).run()
         finally:
             if recorder is not None:
                 recorder.close()
@@ -161,9 +155,6 @@ def make_controller(words: list[str] | None) -> hal.Position | hal.JointImpedanc
         CommandError: There is no such controller, or it does not take these arguments (code ``bad_controller``).
     """
     import yaml
-
-    import hal
-    from hal.errors import CommandError
 
     if words is None:
         return None
@@ -207,8 +198,6 @@ def _policy(rig: Rig, robot: Robot, args: argparse.Namespace, config: PolicyConf
 @contextlib.contextmanager
 def _lerobot_server(checkpoint: str) -> Iterator[str]:
     """Start ``hal serve-lerobot`` in a process of its own, which ends with this one; yield its address."""
-    from hal.errors import PolicyError
-
     command = [sys.executable, "-m", "hal.apps.serve_lerobot", checkpoint, "--port", "0", "--until-stdin-ends"]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     with subprocess.Popen(command, text=True, errors="replace", **pipes) as server:
@@ -270,11 +259,11 @@ class RolloutRun:
         recorder: Recorder | None,
         deadman: Deadman | None,
         mapping: TeleopMapping | None,
+        button: str,
     ) -> None:
-        """Prepare to run a policy. ``deadman`` and ``mapping`` are those of the pad; None without a dead-man."""
-        from hal.apps._display import StatusLine
+        """Prepare to run a policy; the last three arguments are those of the pad; None, and "", without a dead-man."""
         from hal.learning.asynchronous import RemotePolicy
-        from hal.learning.policy import PolicyRunner, load_object
+        from hal.learning.policy import PolicyRunner
         from hal.learning.takeover import Takeover
         from hal.teleop import Teleop
 
@@ -288,21 +277,20 @@ class RolloutRun:
         self.robot = self.robots.get(robot.name) or next(iter(self.robots.values()))
         """The arm that a person drives in a takeover."""
         self.pad: Gamepad | None = None
-        self.button = ""
+        self.button = button
         """Name of the dead-man's control, if it must be held."""
         self.marks: dict[str, bool] = {}
         """Button -> how it marks an episode."""
         self.takeover: Takeover | None = None
         if mapping is not None:
             self.pad = next(iter(rig.gamepads.values()))
-            self.button = self.pad.control_name(mapping.deadman)
             self.marks = {mapping.actions[name]: mark for name, mark in MARKS.items() if name in mapping.actions}
             if args.takeover:
                 self.takeover = Takeover(Teleop(self.robot, mapping), self.pad)
         self.line, self._noted, self._next_note = StatusLine(), "", 0.0
         if recorder is not None:
             recorder.source = self._driver
-        self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
+        self.reset_function = load_named(args, "reset")
         self.runner = PolicyRunner(
             rig,
             policy,
@@ -314,7 +302,7 @@ class RolloutRun:
             controller=make_controller(args.controller),
             cameras=None if self.remote is None else self.remote.config.cameras(),
             history=args.history,
-            success=load_object(args.success, "--success") if args.success else None,
+            success=load_named(args, "success"),
             mark=self._mark,
             takeover=self.takeover,
         )
@@ -324,8 +312,6 @@ class RolloutRun:
 
     def run(self) -> int:
         """Run all episodes, or until a device or a person ends the run. Return the exit status."""
-        from hal.errors import HalError, MotionStopped, RobotFault
-
         self.runner.rehearse()
         ended, failed = "", False
         try:
@@ -345,8 +331,7 @@ class RolloutRun:
             ended, failed = f"{type(error).__name__}: {error}", True
         self.line.clear()
         self._print_results(ended)
-        if self.args.report:
-            Path(self.args.report).write_text(json.dumps(self._report(ended), indent=2) + "\n")
+        write_report(self.args.report, self._report(ended))
         return ACTION_NEEDED if failed else ENDED_EARLY if ended or self._reasons() else 0
 
     def _continues_after(self, outcome: PolicyOutcome) -> bool:
@@ -354,7 +339,6 @@ class RolloutRun:
 
         A reset also ends the fault of a simulated arm that something held away from its set-point.
         """
-        from hal.errors import RobotFault
         from hal.learning.episode import stands_in_world
         from hal.learning.policy import POLICY_STOPS
 
@@ -371,8 +355,6 @@ class RolloutRun:
         Raises:
             PolicyError: It does not in time.
         """
-        from hal.errors import PolicyError
-
         if self.remote is None or self.remote.client.connected:
             return None
         client, end = self.remote.client, time.monotonic() + RECONNECT_TIMEOUT
@@ -402,8 +384,6 @@ class RolloutRun:
         return next((self.marks[name] for name in self.pressed - before), None)
 
     def _episode(self, seed: int) -> PolicyOutcome:
-        from hal.errors import PolicyError
-
         number = len(self.outcomes)
         self._reset(number, seed)
         self.pressed = set(self.marks)
@@ -474,8 +454,6 @@ class RolloutRun:
 
     def _show(self, number: int, seconds: float) -> None:
         if self.pad is not None and self.pad.finished and self.deadman is not None and not self.deadman.held:
-            from hal.errors import CommandError
-
             raise CommandError("the recorded pad has ended, and nothing holds the dead-man", code="pad_finished")
         self.line.update(lambda: f"  episode {number}: {seconds:6.1f} of {self.args.seconds:g} s")
         driver, now = self._driver(), self.rig.clock.now()
@@ -527,7 +505,7 @@ class RolloutRun:
                     "repeated": outcome.repeated,
                     "pauses": outcome.pauses,
                     "interventions": outcome.interventions,
-                    "inference_ms": {name: _ms(value) for name, value in outcome.inference.items()},
+                    "inference_ms": {name: to_ms(value) for name, value in outcome.inference.items()},
                     "policy": dict(outcome.statistics),
                 }
                 for number, outcome in enumerate(self.outcomes)
@@ -540,13 +518,9 @@ def _placed(name: str, pose: Pose) -> str:
     return f"{name} at x {x:.3f}, y {y:.3f}, z {z:.3f} m"
 
 
-def _ms(seconds: float | None) -> float | None:
-    return None if seconds is None else 1e3 * seconds
-
-
 def _describe(outcome: PolicyOutcome) -> str:
     """Return the result of an episode in one line."""
-    p50, p99 = (_ms(outcome.inference[name]) or 0.0 for name in ("p50", "p99"))
+    p50, p99 = (to_ms(outcome.inference[name]) or 0.0 for name in ("p50", "p99"))
     how = {"time": "time limit reached", "stopped": "STOPPED", "error": "the policy raised an error"}
     mark = {True: ", success", False: ", failure", None: ""}[outcome.success if outcome.ended == "time" else None]
     why = f" ({outcome.code}: {outcome.reason})" if outcome.code else ""
@@ -561,7 +535,7 @@ def _describe(outcome: PolicyOutcome) -> str:
 
 def _describe_chunks(figures: Mapping[str, Any]) -> str:
     """Return the figures of a policy on a server in one line."""
-    p50, p99 = (_ms(figures["latency"][name]) or 0.0 for name in ("p50", "p99"))
+    p50, p99 = (to_ms(figures["latency"][name]) or 0.0 for name in ("p50", "p99"))
     counts = f"{figures['chunks']} chunk(s), {figures['late']} late, {figures['steep']} steep"
     return f"{counts}, latency p50 {p50:.0f}, p99 {p99:.0f} ms"
 

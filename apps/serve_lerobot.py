@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from hal.apps._common import run_app
+from hal.apps._common import program
 from hal.errors import CommandError, DriverMissing
 
 STATE, IMAGES, ACTION = "observation.state", "observation.images.", "action"
@@ -56,12 +56,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
     from hal.learning.remote import PolicyServer
 
     if args.until_stdin_ends:

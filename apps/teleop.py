@@ -10,7 +10,20 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps._common import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
+import hal
+from hal.apps._common import (
+    add_driving_options,
+    add_rig_options,
+    check_driving_options,
+    check_report,
+    program,
+    resolve_plan,
+    rig_options,
+    select_robots,
+    write_report,
+)
+from hal.apps._display import TeleopDisplay, banner, list_links
+from hal.errors import CommandError, HalError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,8 +31,6 @@ if TYPE_CHECKING:
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.types import PadState
-
-__all__ = ["TeleopRun", "main", "parser"]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -36,27 +47,14 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+@program(parser)
+def main(args: argparse.Namespace) -> int:
     """Run ``teleop``; return the exit status."""
-    return run_app(_main, parser(), argv)
-
-
-def _main(args: argparse.Namespace) -> int:
-    import hal
-    from hal.apps._common import check_driving_options, check_report, resolve_plan, select_robots
-    from hal.apps._display import banner
-    from hal.apps.check import may_open
-    from hal.errors import CommandError
-
     check_driving_options(args)
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
     check_report(args.report)
-    plan = resolve_plan(args)
-    if plan is None:
-        return 0
-    if not may_open(plan):
-        return ACTION_NEEDED
+    resolve_plan(args)
     with hal.open(**rig_options(args)) as rig:
         print(banner(rig), flush=True)
         return TeleopRun(rig, select_robots(rig, args), args).run()
@@ -66,8 +64,6 @@ class TeleopRun:
     """One run of the program on an open rig."""
 
     def __init__(self, rig: Rig, robots: Sequence[Robot], args: argparse.Namespace) -> None:
-        from hal.apps._display import TeleopDisplay
-
         self.rig, self.args = rig, args
         self.display = TeleopDisplay(
             rig,
@@ -82,8 +78,6 @@ class TeleopRun:
 
     def run(self) -> int:
         """Drive until the time is over, a recorded pad ends or Ctrl-C; then report. Return the exit status."""
-        from hal.apps._display import list_links
-
         display, clean = self.display, False
         reason = "stopped"
         try:
@@ -112,11 +106,9 @@ class TeleopRun:
 
     def _write_report(self, clean: bool) -> None:
         """Write the report; if the rig cannot answer any more, print why there is none."""
-        from hal.errors import HalError
-
         report = self.display.report
         try:
-            report.write(self.args.report, report.collect(clean))
+            write_report(self.args.report, report.collect(clean))
         except (HalError, OSError) as error:
             self.display.line.event(f"no report: {error}")
 

@@ -214,6 +214,13 @@ class ConnectionLost(HalError, ConnectionError):
     final: bool = False
     """Whether the device cannot come back (a recording has ended); there is then no attempt to reconnect."""
 
+    @classmethod
+    def of(cls, name: str, fault: Fault) -> ConnectionLost:
+        """Return the error of the device ``name`` that does not answer because of a fault."""
+        error = cls(f"{name}: {fault.cause}; {fault.remedy}", code=fault.code)
+        error.fault = fault
+        return error
+
 
 class StaleStateError(HalError, TimeoutError):
     """The newest state or frame is older than the caller allows."""

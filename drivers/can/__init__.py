@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from hal.registry import DriverSpec
 
-__all__ = ["DAMIAO", "PIPER"]
-
 _BUS_OPTIONS = ("interface", "channel", "fd", "bus", "bit_rate", "data_bit_rate")
 _REQUIRES = {"can": "pip install 'robot-hal[can]'"}
 

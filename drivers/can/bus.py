@@ -24,8 +24,6 @@ from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, DriverMissin
 
 from .settings import BusSettings
 
-__all__ = ["CanBus", "FrameHandler"]
-
 FrameHandler = Callable[[bytearray], None]
 """Function that a frame's data is handed to."""
 
@@ -205,10 +203,7 @@ class CanBus:
 
     def error(self, name: str) -> ConnectionLost:
         """Return the exception that a device raises while the bus does not work; ``name`` is the device's."""
-        fault = self.fault or Fault("closed", "it is not open", "open the rig")
-        error = ConnectionLost(f"{name}: {fault.cause}; {fault.remedy}", code=fault.code)
-        error.fault = fault
-        return error
+        return ConnectionLost.of(name, self.fault or Fault("closed", "it is not open", "open the rig"))
 
     def _explain(self, error: Exception) -> HalError:
         """Return the error of this package that an interface's exception stands for."""
@@ -385,9 +380,7 @@ def _errno_of(error: BaseException) -> int | None:
 
 
 def _lost(where: str, cause: str, remedy: str, code: str) -> ConnectionLost:
-    error = ConnectionLost(f"{where}: {cause}; {remedy}", code=code)
-    error.fault = Fault(code, cause, remedy)
-    return error
+    return ConnectionLost.of(where, Fault(code, cause, remedy))
 
 
 def _not_found(where: str, cause: str, remedy: str, code: str) -> DeviceNotFound:

@@ -28,8 +28,6 @@ from .damiao_chain import SWITCHING, DamiaoChain
 from .damiao_motor import MILD_FAULTS, ChainMotor, find_turned, motor_fault
 from .settings import DamiaoArmSettings
 
-__all__ = ["DamiaoArm"]
-
 _STICKING = 0.02
 """Speed below which the friction that a command adds falls to zero, rad/s: it would make a joint at rest tremble."""
 _PUSHING = 0.5

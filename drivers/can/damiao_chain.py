@@ -28,8 +28,6 @@ from .damiao_protocol import (
 )
 from .settings import BusSettings, DamiaoMotorSettings, emulator_remedy, is_emulated
 
-__all__ = ["SILENCE", "SWITCHING", "DamiaoChain"]
-
 Weight = Callable[[Sequence[float]], Sequence[float]]
 """Function that returns the torques (n,), Nm, that carry a device at joint positions (n,), rad."""
 
@@ -321,9 +319,7 @@ class DamiaoChain:
             f"no answer from {names} on {self.settings.channel} for {1e3 * SILENCE:.0f} ms",
             "check its power and its cable; the arm may sink",
         )
-        error = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
-        error.fault = fault
-        return error
+        return ConnectionLost.of(self.name, fault)
 
     def ask_registers(self) -> bool:
         """Ask motors that were off for their registers, one at a time; return whether some are still missing.
@@ -350,8 +346,7 @@ class DamiaoChain:
             return
         fault = self.register_fault()
         if fault is not None:
-            self.lost = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
-            self.lost.fault = fault
+            self.lost = ConnectionLost.of(self.name, fault)
         elif not waiting:
             self.lost = None
 

@@ -29,8 +29,6 @@ from .damiao_motor import MILD_FAULTS
 from .damiao_protocol import KP_MAX
 from .settings import DamiaoGripperSettings
 
-__all__ = ["DamiaoGripper", "FingerTable"]
-
 _STILL = 0.003
 """Largest speed of the width at rest, m/s."""
 _REST = 0.06

@@ -21,16 +21,6 @@ from .damiao_protocol import (
 )
 from .settings import DamiaoMotorSettings
 
-__all__ = [
-    "CHECKED_REGISTERS",
-    "HEAT_MARGIN",
-    "MILD_FAULTS",
-    "ChainMotor",
-    "find_turned",
-    "motor_fault",
-    "register_problems",
-]
-
 CHECKED_REGISTERS = (
     MotorRegister.PMAX,
     MotorRegister.VMAX,

@@ -27,39 +27,6 @@ from enum import IntEnum
 from types import MappingProxyType
 from typing import NamedTuple
 
-__all__ = [
-    "CLEAR_ERROR",
-    "DISABLE",
-    "ENABLE",
-    "KD_MAX",
-    "KP_MAX",
-    "MASTER_OFFSET",
-    "MIT_MODE",
-    "MOTOR_RANGES",
-    "READ_REGISTER",
-    "REGISTER_ID",
-    "SAVE_REGISTERS",
-    "SET_ZERO",
-    "STATE_REQUEST",
-    "TIMEOUT_UNIT",
-    "WRITE_REGISTER",
-    "MotorCodec",
-    "MotorCommand",
-    "MotorFeedback",
-    "MotorRange",
-    "MotorRegister",
-    "MotorStatus",
-    "RegisterReply",
-    "RegisterRequest",
-    "decode_register_reply",
-    "decode_register_request",
-    "encode_register_read",
-    "encode_register_reply",
-    "encode_register_write",
-    "encode_save",
-    "encode_state_request",
-]
-
 KP_MAX, KD_MAX = 500.0, 5.0
 """Largest gains of a command, Nm/rad and Nm s/rad. The smallest are 0."""
 MASTER_OFFSET = 0x10

@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 from .bus import bring_up, can_interfaces
 from .settings import BusSettings
 
-__all__ = ["CanInterface", "list_buses", "parse_links", "read_interfaces"]
-
 _PATIENCE = 3.0
 """Longest time that ``ip`` may take, s."""
 

@@ -42,8 +42,6 @@ from .piper_protocol import (
 )
 from .settings import PiperArmSettings
 
-__all__ = ["PiperArm"]
-
 _PATIENCE = 2.0
 """Longest time to wait for another program to release the arm, s."""
 _ASK_AGAIN = 0.02

@@ -11,8 +11,6 @@ from .piper_link import FRESH_READS, SILENCE, PiperLink, gripper_fault
 from .piper_protocol import ENABLED, GRIPPER_IDS, GripperRequest, GripperStatus, PiperFeedback
 from .settings import PiperGripperSettings
 
-__all__ = ["PiperGripper"]
-
 _AT_REST = 0.15
 """Time without motion after which the fingers are at rest, s."""
 _STILL = 2e-4

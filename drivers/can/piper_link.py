@@ -14,18 +14,6 @@ from .bus import CanBus
 from .piper_protocol import COMMAND_IDS, ENABLED, JOINTS, GripperStatus, PiperFeedback, PiperStatus, decode_feedback
 from .settings import EMULATED_INTERFACES, BusSettings, emulator_remedy
 
-__all__ = [
-    "FRESH_READS",
-    "SILENCE",
-    "PiperLink",
-    "arm_fault",
-    "control_fault",
-    "gripper_fault",
-    "join_joints",
-    "refusal",
-    "silence_remedy",
-]
-
 SILENCE = 0.1
 """Silence after which the arm or the gripper counts as lost, s."""
 FRESH_READS = 2
@@ -227,8 +215,7 @@ class PiperLink:
     def lose(self, what: str) -> ConnectionLost:
         """Return the exception for a device that does not report any more, and note that it is lost."""
         remedy = silence_remedy(self._open_bus(), self.source)
-        self.lost = ConnectionLost(f"{self.name}: {what}; {remedy}", code="silent")
-        self.lost.fault = Fault("silent", what, remedy)
+        self.lost = ConnectionLost.of(self.name, Fault("silent", what, remedy))
         return self.lost
 
     def statistics(self) -> dict[str, Any]:

@@ -47,8 +47,6 @@ from .settings import (
     PiperGripperSettings,
 )
 
-__all__ = ["bus_load", "check_damiao", "check_piper", "judge_interface"]
-
 _CLASSIC_BITS = 130
 """Length of a classic frame with 8 bytes, with the usual number of stuff bits and the gap after it, bits."""
 _FD_BITS = 40, 95

@@ -10,34 +10,18 @@ import itertools
 import shlex
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 from zlib import crc32
 
-from pydantic import BaseModel, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from hal.config.files import Problems, find_closest, validate
+from hal.config.files import DeviceSettings, find_closest
 from hal.config.schema import Flag, Quantity, Size, Strict, describe, is_number
 from hal.kinematics.inertials import find_wrong_inertials
 from hal.specs import GripperSpec, RobotSpec
 
 from .damiao_protocol import KD_MAX, KP_MAX, MASTER_OFFSET, MOTOR_RANGES, MotorRange
 from .piper_protocol import JOINTS
-
-__all__ = [
-    "BusSettings",
-    "DamiaoArmSettings",
-    "DamiaoGripperSettings",
-    "DamiaoMotorSettings",
-    "PiperArmSettings",
-    "PiperGripperSettings",
-    "check_damiao_arm",
-    "check_damiao_gripper",
-    "check_piper_arm",
-    "check_piper_gripper",
-    "emulator_remedy",
-    "group_key",
-    "is_emulated",
-]
 
 EMULATED_INTERFACES = frozenset({"virtual", "udp_multicast"})
 """Interfaces of python-can behind which there is no hardware."""
@@ -157,7 +141,7 @@ WidthTable = Annotated[tuple[tuple[float, float], ...], BeforeValidator(_width_t
 # Records.
 
 
-class BusSettings(Strict):
+class BusSettings(DeviceSettings):
     """A CAN bus, as python-can opens it."""
 
     interface: Annotated[str, _text("an interface of python-can, for example socketcan")]
@@ -265,11 +249,6 @@ class DamiaoArmSettings(BusSettings):
     """Largest distance of a joint from its set-point, rad. Beyond it, or where the motor pushes with half of its
     greatest torque because of it, the arm is blocked, and holds where it is."""
 
-    @classmethod
-    def of(cls, spec: RobotSpec) -> DamiaoArmSettings:
-        """Return the settings in an arm's record. Raises ConfigError, which lists every problem."""
-        return _of(cls, spec.options, f"robots.{spec.name}.real")
-
 
 class DamiaoGripperSettings(BusSettings):
     """Settings under ``real:`` of a gripper with a Damiao motor; those of the bus default to the arm's."""
@@ -282,11 +261,6 @@ class DamiaoGripperSettings(BusSettings):
     """As in the arm's settings."""
     tolerance: Size = 0.001
     """Largest distance from the target width at which the fingers count as arrived, m."""
-
-    @classmethod
-    def of(cls, spec: GripperSpec) -> DamiaoGripperSettings:
-        """Return the settings in a gripper's record. Raises ConfigError, which lists every problem."""
-        return _of(cls, spec.options, f"{spec.name}.real")
 
 
 class PiperArmSettings(BusSettings):
@@ -303,11 +277,6 @@ class PiperArmSettings(BusSettings):
         """The mounting as a number of the protocol."""
         return 0 if self.mounting is None else 1 + ("upright", "left", "right").index(self.mounting)
 
-    @classmethod
-    def of(cls, spec: RobotSpec) -> PiperArmSettings:
-        """Return the settings in an arm's record. Raises ConfigError, which lists every problem."""
-        return _of(cls, spec.options, f"robots.{spec.name}.real")
-
 
 class PiperGripperSettings(BusSettings):
     """Settings under ``real:`` of a PiPER's gripper; those of the bus default to the arm's."""
@@ -319,28 +288,13 @@ class PiperGripperSettings(BusSettings):
     tolerance: Size = 0.001
     """Largest distance from the target width at which the fingers count as arrived, m."""
 
-    @classmethod
-    def of(cls, spec: GripperSpec) -> PiperGripperSettings:
-        """Return the settings in a gripper's record. Raises ConfigError, which lists every problem."""
-        return _of(cls, spec.options, f"{spec.name}.real")
-
-
-_Settings = TypeVar("_Settings", bound=BaseModel)
-
-
-def _of(model: type[_Settings], options: Mapping[str, Any], where: str) -> _Settings:
-    problems = Problems()
-    settings = validate(model, options, where, problems)
-    problems.raise_any()
-    return settings
-
 
 # Checks of a rig. Keys are relative to the device's entry.
 
 
 def check_damiao_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
     """Yield the problems in an arm's record: key in the arm's entry of the rig, message and code."""
-    settings, problems = _checked(DamiaoArmSettings, spec.options)
+    settings, problems = DamiaoArmSettings.check(spec)
     yield from problems
     if settings is None:
         return
@@ -350,7 +304,7 @@ def check_damiao_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
         return
     gripper = spec.gripper
     shared = gripper is not None and gripper.driver == spec.driver
-    other = _checked(DamiaoGripperSettings, gripper.options)[0] if gripper is not None and shared else None
+    other = DamiaoGripperSettings.check(gripper)[0] if gripper is not None and shared else None
     motors = [*settings.motors, *([other.motor] if other is not None and other.key == settings.key else [])]
     yield from _collisions(motors)
     for k, (joint, motor) in enumerate(zip(spec.joints, settings.motors, strict=True)):
@@ -371,7 +325,7 @@ def check_damiao_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
 
 def check_damiao_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
     """Yield the problems in a gripper's record: key in the gripper's entry of the rig, message and code."""
-    settings, problems = _checked(DamiaoGripperSettings, spec.options)
+    settings, problems = DamiaoGripperSettings.check(spec)
     yield from problems
     if settings is None:
         return
@@ -391,7 +345,7 @@ _PIPER_BIT_RATE = 1_000_000
 
 def check_piper_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
     """Yield the problems in an arm's record: key in the arm's entry of the rig, message and code."""
-    settings, problems = _checked(PiperArmSettings, spec.options)
+    settings, problems = PiperArmSettings.check(spec)
     yield from problems
     if len(spec.joints) != JOINTS:
         yield "model", f"must have {JOINTS} joints for a PiPER, not {len(spec.joints)}", "wrong_count"
@@ -403,7 +357,7 @@ def check_piper_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
 
 def check_piper_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
     """Yield the problems in a gripper's record: key in the gripper's entry of the rig, message and code."""
-    settings, problems = _checked(PiperGripperSettings, spec.options)
+    settings, problems = PiperGripperSettings.check(spec)
     yield from problems
     if settings is not None:
         yield from _piper_bus(settings)
@@ -414,14 +368,6 @@ def _piper_bus(settings: BusSettings) -> Iterator[tuple[str, str, str]]:
         yield "real.fd", "must be false: a PiPER has classic CAN, and an FD frame would stop its bus", "not_supported"
     if settings.bit_rate != _PIPER_BIT_RATE:
         yield "real.bit_rate", f"must be {_PIPER_BIT_RATE}, a PiPER's only one, not {settings.bit_rate}", "out_of_range"
-
-
-def _checked(model: type[_Settings], options: Mapping[str, Any]) -> tuple[_Settings | None, list[tuple[str, str, str]]]:
-    """Return the settings, None if they have problems, and the problems."""
-    problems = Problems()
-    settings = validate(model, options, "", problems, "real")
-    found = [(problem.key, problem.message, problem.code) for problem in problems.found]
-    return (None if found else settings), found
 
 
 def _collisions(motors: list[DamiaoMotorSettings]) -> Iterator[tuple[str, str, str]]:

@@ -1,40 +1,23 @@
 """The input devices of this machine: what is plugged in, an opened device, and when to look again.
 
 :class:`LinuxInput` lists devices from sysfs, which needs no permission and opens nothing. :class:`EvdevNode` is one
-opened device on python-evdev. :class:`DeviceFinder` scans as soon as the kernel reports a change, or periodically.
+opened device on python-evdev. :class:`DeviceFinder` scans periodically.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import fcntl
 import os
-import select
 import struct
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from hal.errors import DriverMissing
 from hal.pads.codes import ABS, EV_ABS, EV_FF, EV_KEY, EV_REL, FF_RUMBLE, KEY, REL
 from hal.pads.mapper import AxisRange
 from hal.pads.model import Identity
-
-__all__ = [
-    "DeviceFinder",
-    "EvdevNode",
-    "Event",
-    "FolderWatch",
-    "InputSystem",
-    "LinuxInput",
-    "InputNode",
-    "NodeInfo",
-    "evdev_module",
-    "lock_device",
-    "permission_note",
-]
 
 
 class NodeInfo(NamedTuple):
@@ -82,51 +65,6 @@ class Event(NamedTuple):
     """The kernel's stamp, s."""
 
 
-class InputNode(Protocol):
-    """An opened input device as the driver needs it. Calls raise OSError when the device is gone."""
-
-    path: str
-    axes: dict[int, AxisRange]
-    """Event code -> range that the device reports."""
-    keys: frozenset[int]
-    """Event codes of its buttons."""
-    rels: frozenset[int]
-    """Event codes of its relative axes."""
-    can_rumble: bool
-    """Whether it has motors, and may be written to."""
-
-    def fileno(self) -> int:
-        """Descriptor that is readable when there are events, and when the device is gone."""
-
-    def read(self) -> Sequence[Event]:
-        """Return every waiting event, oldest first; never blocks."""
-
-    def snapshot(self) -> tuple[dict[int, int], list[int]]:
-        """Return the kernel's present state: axis code -> value, and the codes of the pressed buttons."""
-
-    def claim(self) -> bool:
-        """Lock the device for one gamepad, across programs, until it is closed; False where it is locked already.
-
-        Two gamepads on one device would be one thumb on two dead-man switches.
-        """
-
-    def close(self) -> None:
-        """Close the device. Idempotent."""
-
-
-class InputSystem(Protocol):
-    """A source of input devices."""
-
-    def nodes(self) -> list[NodeInfo]:
-        """Return all present devices in the order of their numbers. Takes some ms on a computer with many."""
-
-    def fingerprint(self) -> object:
-        """Return a value that differs after a device came or went, or its permissions changed. Cheap."""
-
-    def open(self, path: str) -> InputNode:
-        """Open a device. Raises OSError."""
-
-
 # Devices through python-evdev and sysfs.
 
 _EVIOCSCLOCKID = 0x400445A0  # _IOW('E', 0xa0, int), linux/input.h
@@ -145,17 +83,15 @@ def evdev_module() -> Any:
     return evdev
 
 
-def lock_device(fd: int) -> bool:
-    """Lock a device until ``fd`` is closed; False where another opening of it has the lock, in any program."""
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
 class EvdevNode:
-    """A :class:`InputNode` on python-evdev."""
+    """An opened input device, through python-evdev. Calls raise OSError when the device is gone.
+
+    Attributes:
+        axes: Event code -> range that the device reports.
+        keys: Event codes of its buttons.
+        rels: Event codes of its relative axes.
+        can_rumble: Whether it has motors, and may be written to.
+    """
 
     def __init__(self, path: str) -> None:
         """Open the device at ``path``.
@@ -179,9 +115,11 @@ class EvdevNode:
             self._monotonic = False
 
     def fileno(self) -> int:
+        """Descriptor that is readable when there are events, and when the device is gone."""
         return int(self._device.fd)
 
     def read(self) -> Sequence[Event]:
+        """Return every waiting event, oldest first; never blocks."""
         found: list[Any] = []
         for _ in range(_READS):
             try:
@@ -197,24 +135,40 @@ class EvdevNode:
         ]
 
     def snapshot(self) -> tuple[dict[int, int], list[int]]:
+        """Return the kernel's present state: axis code -> value, and the codes of the pressed buttons."""
         values = {code: int(self._device.absinfo(code).value) for code in self.axes}
         return values, [int(code) for code in self._device.active_keys()]
 
     def claim(self) -> bool:
+        """Lock the device for one gamepad, across programs, until it is closed; False where it is locked already.
+
+        Two gamepads on one device would be one thumb on two dead-man switches.
+        """
         return lock_device(self._device.fd)
 
     def close(self) -> None:
+        """Close the device. Idempotent."""
         self._device.close()
 
 
+def lock_device(fd: int) -> bool:
+    """Lock a device until ``fd`` is closed; False where another opening of it has the lock, in any program."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
 class LinuxInput:
-    """The :class:`InputSystem` of this machine."""
+    """The input devices of this machine."""
 
     def __init__(self, sysfs: Path = Path("/sys/class/input"), devices: Path = Path("/dev/input")) -> None:
         self._sysfs = sysfs
         self._devices = devices
 
     def nodes(self) -> list[NodeInfo]:
+        """Return all present devices in the order of their numbers. Takes some ms on a computer with many."""
         found = []
         for name in sorted(self._event_names(self._sysfs), key=lambda name: int(name[5:])):
             device = self._sysfs / name / "device"
@@ -232,6 +186,7 @@ class LinuxInput:
         return found
 
     def fingerprint(self) -> object:
+        """Return a value that differs after a device came or went, or its permissions changed. Cheap."""
         marks = []
         for name in sorted(self._event_names(self._devices)):
             try:
@@ -241,7 +196,8 @@ class LinuxInput:
             marks.append((name, status.st_ino, status.st_ctime_ns))
         return tuple(marks)
 
-    def open(self, path: str) -> InputNode:
+    def open(self, path: str) -> EvdevNode:
+        """Open a device. Raises OSError."""
         return EvdevNode(path)
 
     @staticmethod
@@ -297,91 +253,21 @@ def _kernel_driver(parent: str) -> str:
 
 # When to look for devices.
 
-# From the kernel's include/uapi/linux/inotify.h.
-_ATTRIB, _MOVED_FROM, _MOVED_TO, _CREATE, _DELETE = 0x04, 0x40, 0x80, 0x100, 0x200
-_DELETE_SELF, _MOVE_SELF, _IGNORED = 0x400, 0x800, 0x8000
-_ONLYDIR = 0x01000000
-_INOTIFY_EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of the name that follows
-
 _RESCAN = 0.2
-"""Time between two scans without a watch, s."""
-_RESCAN_WATCHED = 2.0
-"""Time between two scans with a watch, s."""
-
-
-class FolderWatch:
-    """Changes in a folder, ``/dev/input``, through the kernel's inotify.
-
-    udev sets the permissions of a new device a moment after the kernel has made it; that is a change of its own.
-    """
-
-    def __init__(self, folder: str = "/dev/input") -> None:
-        """Begin to watch. Raises OSError: no such folder, or the user has no inotify watches left."""
-        libc = ctypes.CDLL(None, use_errno=True)
-        try:
-            begin, add = libc.inotify_init1, libc.inotify_add_watch
-        except AttributeError:
-            raise OSError("the C library has no inotify") from None
-        self._fd = _checked(begin(os.O_NONBLOCK | os.O_CLOEXEC), folder)
-        mask = _ATTRIB | _MOVED_FROM | _MOVED_TO | _CREATE | _DELETE | _DELETE_SELF | _MOVE_SELF | _ONLYDIR
-        try:
-            _checked(add(self._fd, os.fsencode(folder), mask), folder)
-        except OSError:
-            self.close()
-            raise
-
-    def fileno(self) -> int:
-        """Descriptor that is readable after a change."""
-        return self._fd
-
-    def changed(self) -> bool:
-        """Whether anything changed since the last call. Never blocks. Raises OSError when the folder is gone."""
-        found = False
-        while True:
-            try:
-                data = os.read(self._fd, 65536)
-            except BlockingIOError:
-                return found
-            found = True
-            at = 0
-            while at < len(data):
-                _, mask, _, length = _INOTIFY_EVENT.unpack_from(data, at)
-                if mask & (_DELETE_SELF | _MOVE_SELF | _IGNORED):
-                    raise OSError("the watched folder is gone")
-                at += _INOTIFY_EVENT.size + length
-
-    def close(self) -> None:
-        """Stop watching. Idempotent."""
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            with contextlib.suppress(OSError):
-                os.close(fd)
-
-
-def _checked(result: int, folder: str) -> int:
-    if result < 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number), folder)
-    return result
+"""Time between two scans, s."""
 
 
 class DeviceFinder:
-    """Lists the devices of an input system, no more often than needed."""
+    """Lists the devices of a machine, no more often than needed."""
 
-    def __init__(self, system: InputSystem, *, watched: bool) -> None:
-        """Make a finder for ``system``; ``watched`` if inotify reports its changes: its devices are this machine's."""
+    def __init__(self, system: LinuxInput) -> None:
         self._system = system
-        self._watched = watched
-        self._watch: FolderWatch | None = None
         self._seen: object = None
         self._next = 0.0
 
     def scan(self) -> list[NodeInfo] | None:
         """Return the devices that are plugged in; None where nothing changed since the last scan."""
-        if self._watched and self._watch is None:
-            with contextlib.suppress(OSError):  # no input devices at all, or too many watches: scan periodically
-                self._watch = FolderWatch()
-        self._next = time.monotonic() + (_RESCAN if self._watch is None else _RESCAN_WATCHED)
+        self._next = time.monotonic() + _RESCAN
         mark = self._system.fingerprint()
         if mark == self._seen:
             return None
@@ -389,39 +275,13 @@ class DeviceFinder:
         return self._system.nodes()
 
     def forget(self) -> None:
-        """Make the next scan, which is due soon, return the devices in any case."""
+        """Make the next scan return the devices in any case."""
         self._seen = None
-        self._next = min(self._next, time.monotonic() + _RESCAN)
 
     def due(self) -> bool:
         """Whether it is time for a scan."""
-        return self._changed() or time.monotonic() >= self._next
+        return time.monotonic() >= self._next
 
-    def wait(self, timeout: float) -> bool:
-        """Wait up to ``timeout`` s for a change; True if there was one."""
-        if self._watch is None:
-            time.sleep(timeout)
-            return False
-        poller = select.poll()
-        poller.register(self._watch.fileno(), select.POLLIN)
-        return bool(poller.poll(timeout * 1e3)) and self._changed()
-
-    def _changed(self) -> bool:
-        if self._watch is None:
-            return False
-        try:
-            return self._watch.changed()
-        except OSError:  # the folder is gone with the last device; it comes back with the next
-            self._watch.close()
-            self._watch = None
-            return True
-
-    def open(self, info: NodeInfo) -> InputNode:
+    def open(self, info: NodeInfo) -> EvdevNode:
         """Open a device. Raises OSError."""
         return self._system.open(info.path)
-
-    def close(self) -> None:
-        """Stop watching. Idempotent."""
-        if self._watch is not None:
-            self._watch.close()
-        self._watch = None

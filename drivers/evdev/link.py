@@ -12,10 +12,8 @@ from hal.pads.codes import BUS_USB, EV_KEY, EV_SYN, KEY, SYN_DROPPED, SYN_REPORT
 from hal.pads.mapper import PadMapper
 from hal.pads.model import MatchRule, PadModel
 
-from .finder import InputNode, NodeInfo
+from .finder import EvdevNode, NodeInfo
 from .rumble import Rumble
-
-__all__ = ["PadLink"]
 
 _SEPARATE = frozenset({KEY["BTN_MODE"], KEY["BTN_LEFT"]})
 """Buttons that may come in reports of their own, which tell nothing about the other controls: xpad does so with the
@@ -36,7 +34,7 @@ class PadLink:
     unplugging is seen, that is, with a cable.
     """
 
-    def __init__(self, info: NodeInfo, node: InputNode, model: PadModel, rule: MatchRule | None) -> None:
+    def __init__(self, info: NodeInfo, node: EvdevNode, model: PadModel, rule: MatchRule | None) -> None:
         self.info = info
         self.model = model
         self.title = rule.title if rule is not None and rule.title is not None else model.title
@@ -48,8 +46,8 @@ class PadLink:
         """Time of the newest event, at first that of the first poll, and of the last proof of life; s, rig's clock."""
         self.t_device = 0.0
         self._node = node
-        self._motion: InputNode | None = None
-        self._touch: InputNode | None = None
+        self._motion: EvdevNode | None = None
+        self._touch: EvdevNode | None = None
         self._beats = 0
         """Reports of the motion sensor so far."""
         self._known = False
@@ -78,12 +76,12 @@ class PadLink:
         """Whether the touchpad is still to be found."""
         return self.model.touch_node is not None and self._touch is None
 
-    def add_motion(self, motion: InputNode) -> None:
+    def add_motion(self, motion: EvdevNode) -> None:
         """Use the pad's motion sensor as its heartbeat, from its first event on."""
         self._motion = motion
         self._poller.register(motion.fileno(), 0)  # wakes a poll only when it is unplugged, not with its events
 
-    def add_touch(self, touch: InputNode) -> None:
+    def add_touch(self, touch: EvdevNode) -> None:
         """Use the pad's touchpad, whose click is one of the pad's buttons."""
         self._touch = touch
         self._poller.register(touch.fileno(), 0)

@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import sys
+import time
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -19,10 +20,8 @@ from hal.pads.model import PadModel, check_record, choose_model, guess_model, gu
 from hal.specs import PadSpec
 from hal.types import AXES
 
-from .finder import DeviceFinder, InputNode, InputSystem, LinuxInput, NodeInfo, evdev_module, permission_note
+from .finder import DeviceFinder, EvdevNode, LinuxInput, NodeInfo, evdev_module, permission_note
 from .link import PadLink
-
-__all__ = ["EvdevPad"]
 
 _RELEASED = MappingProxyType(dict.fromkeys(AXES, 0.0))
 
@@ -48,13 +47,13 @@ class EvdevPad(GamepadDriver):
     options name one.
     """
 
-    def __init__(self, spec: PadSpec, source: object | None = None, *, system: InputSystem | None = None) -> None:
+    def __init__(self, spec: PadSpec, source: object | None = None, *, system: LinuxInput | None = None) -> None:
         super().__init__(spec, source)
         place = f"gamepads.{spec.name}"
         self._options = check_record(EvdevOptions, spec.options, place)
         chosen = (spec.model,) if spec.model is not None else spec.models
         self._models = tuple(pad_model(data, f"{place}, model {data.get('name')}") for data in chosen)
-        self._finder: DeviceFinder | None = DeviceFinder(system, watched=False) if system is not None else None
+        self._finder: DeviceFinder | None = DeviceFinder(system) if system is not None else None
         self._is_open = False
         self._link: PadLink | None = None
         self._rumble: tuple[float, float, float] | None = None
@@ -87,7 +86,7 @@ class EvdevPad(GamepadDriver):
             if sys.platform != "linux":
                 raise NotSupported("the evdev driver reads gamepads on Linux only", code="linux_only")
             evdev_module()
-            self._finder = DeviceFinder(LinuxInput(), watched=True)
+            self._finder = DeviceFinder(LinuxInput())
         self._is_open = True
         self._scan(self._finder)
 
@@ -99,8 +98,8 @@ class EvdevPad(GamepadDriver):
         if (self._link is None or self._link.lacks_motion or self._link.lacks_touch) and finder.due():
             self._scan(finder)
         if self._link is None:
-            if timeout > 0.0 and finder.wait(timeout):
-                self._scan(finder)
+            if timeout > 0.0:
+                time.sleep(timeout)
             return self._last
         try:
             self._link.poll(now, timeout)
@@ -199,7 +198,7 @@ class EvdevPad(GamepadDriver):
             return
         self.flat, self.absolute = self._link.mapper.flat, self._link.mapper.model.absolute
 
-    def _guessed(self, info: NodeInfo, node: InputNode) -> PadModel:
+    def _guessed(self, info: NodeInfo, node: EvdevNode) -> PadModel:
         model = guess_model(info.identity, node.axes, node.keys, node.rels)
         self.notes = (*self.notes, guess_warning(model))
         return model
@@ -220,7 +219,7 @@ class EvdevPad(GamepadDriver):
                     part.close()
                 return
 
-    def _try_open(self, finder: DeviceFinder, info: NodeInfo, *, quiet: bool = False) -> InputNode | None:
+    def _try_open(self, finder: DeviceFinder, info: NodeInfo, *, quiet: bool = False) -> EvdevNode | None:
         """Open a device; None where it is gone, or may not be read (udev sets the permissions a moment later).
 
         ``quiet`` adds no note where it may not be read: a desktop keeps touchpads to itself.
@@ -284,8 +283,6 @@ class EvdevPad(GamepadDriver):
 
     def close(self) -> None:
         self._drop_link()
-        if self._finder is not None:
-            self._finder.close()
         self._last = self._last._replace(axes=_RELEASED, buttons=frozenset(), connected=False, unknown=())
         self._is_open = False
 

@@ -11,8 +11,6 @@ import time
 from hal.gamepad import RUMBLE_SECONDS
 from hal.pads.codes import EV_FF, FF_RUMBLE
 
-__all__ = ["Rumble"]
-
 # From the kernel's include/uapi/linux/input.h. The effect is a union whose largest member holds a pointer, so its size
 # and where it begins depend on the machine.
 _HEAD = "HhH HH HH"  # type, id, direction; trigger: button, interval; replay: length in ms, delay

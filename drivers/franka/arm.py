@@ -33,8 +33,6 @@ from .link import ArmLink, ArmMode, ArmSample, StreamKind
 from .network import PortState, lock_arm, probe_port, resolve_host
 from .settings import ArmSettings, is_emulated
 
-__all__ = ["ArmConnection", "FrankaArm", "create_link"]
-
 _RECOVERY_TIMEOUT = 3.0
 """Longest time until the robot is idle after a recovery, s."""
 _RATED_COMMANDS = 200
@@ -482,10 +480,7 @@ class ArmConnection:
 
     def error(self, fault: Fault | None = None) -> ConnectionLost:
         """Return the exception to raise while there is no connection."""
-        fault = fault or self.lost or Fault("closed", "it is not open", "open the rig")
-        error = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
-        error.fault = fault
-        return error
+        return ConnectionLost.of(self.name, fault or self.lost or Fault("closed", "it is not open", "open the rig"))
 
     def close(self) -> None:
         """Disconnect, and release the arm for other programs. Idempotent."""

@@ -14,8 +14,6 @@ import time
 from contextlib import suppress
 from typing import Any
 
-__all__ = ["LONGEST_CALL", "CallLimit"]
-
 LONGEST_CALL = 1.1
 """Limit of a call, s. The libraries themselves wait 1 s for a state."""
 _SIGEV_THREAD = 2

@@ -14,23 +14,6 @@ from hal.errors import Fault
 
 from .flags import FLAG_TEXTS, LOSSY_FLAGS
 
-__all__ = [
-    "ARM_PORT",
-    "HAND_PORT",
-    "KNOWN_ERRORS",
-    "NO_HAND",
-    "NO_ROUTE",
-    "REFUSED",
-    "UNKNOWN_HOST",
-    "UNREACHABLE",
-    "KnownError",
-    "fault_of",
-    "fault_of_exception",
-    "flags_in",
-    "is_connection_lost",
-    "version_fault",
-]
-
 ARM_PORT, HAND_PORT = 1337, 1338
 """Fixed TCP ports of the arm and of the Franka Hand."""
 _CODE, _CAUSE = 48, 160
@@ -242,26 +225,20 @@ _ARMS = {_PANDA: ("a Panda (FER)", "panda"), _FR3: ("an FR3", "fr3")}
 """Protocol version -> name of the arm, and its model in a rig file."""
 
 
-def fault_of(
-    names: Sequence[str],
-    robot_mode: str,
-    success_rate: float | None = None,
-    realtime_kernel: bool | None = None,
-) -> Fault | None:
+def fault_of(names: Sequence[str], robot_mode: str, realtime_kernel: bool | None = None) -> Fault | None:
     """Return the fault that keeps the robot from moving, according to its state; None if there is none.
 
     Args:
         names: Flags that are set now, or that ended the last motion; in the modes ``idle`` and ``move`` they are
             history and are ignored.
         robot_mode: Mode in the spelling of any library (``Reflex``, ``kUserStopped``, ``user_stopped``).
-        success_rate: Share of the last 100 set-points that arrived in time, 0 to 1; None if unknown.
         realtime_kernel: Whether this computer has a real-time kernel; None if unknown.
     """
     mode = _plain(robot_mode)
     if mode in ("idle", "move"):
         return None
     if mode == "reflex" and names:
-        return _fault_of_flags(names, success_rate, realtime_kernel)
+        return _fault_of_flags(names, None, realtime_kernel)
     known = _MODES.get(mode)
     return known or Fault("unknown_mode", f"the robot is in an unknown mode: {robot_mode}", "look at Desk")
 
@@ -271,7 +248,6 @@ def fault_of_exception(
     *,
     host: str | None = None,
     port: int = ARM_PORT,
-    success_rate: float | None = None,
     realtime_kernel: bool | None = None,
 ) -> Fault:
     """Return the fault that an exception of a client library stands for.
@@ -280,7 +256,6 @@ def fault_of_exception(
         error: Exception of ``pylibfranka`` or ``panda_py``.
         host: Address of the robot, for the texts; None for "the robot".
         port: Port of the connection; a refusal at the hand's port means that there is no hand.
-        success_rate: As in :func:`fault_of`; a rate in the message takes precedence.
         realtime_kernel: As in :func:`fault_of`.
     """
     text = str(error)
@@ -289,8 +264,7 @@ def fault_of_exception(
         return version_fault(*versions)
     names = flags_in(text)
     if names:
-        rate = _rate_in(text)
-        return _fault_of_flags(names, success_rate if rate is None else rate, realtime_kernel)
+        return _fault_of_flags(names, _rate_in(text), realtime_kernel)
     mode = re.search(r'in the current mode \("(\w[\w ]*)"\)', text)
     if mode is not None:
         return fault_of((), mode[1]) or _busy_fault(mode[1])

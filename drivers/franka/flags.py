@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["FLAGS", "FLAG_TEXTS", "LOSSY_FLAGS", "flag_index"]
-
 FLAGS: tuple[str, ...] = (
     "joint_position_limits_violation",
     "cartesian_position_limits_violation",

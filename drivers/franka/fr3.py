@@ -12,8 +12,6 @@ import pylibfranka
 
 from .link import ArmLink, ArmSample, Floats, StreamKind
 
-__all__ = ["Fr3Link"]
-
 _NOISE = 4e-6
 """Noise of the reported positions, rad: within it, the servo's own set-point is more exact than the report."""
 

@@ -18,8 +18,6 @@ from .settings import HandSettings
 if importlib.util.find_spec("panda_py") is None:  # the hand's process imports it; report its absence at once
     raise ModuleNotFoundError("No module named 'panda_py'", name="panda_py")
 
-__all__ = ["FrankaHand"]
-
 _STATE_TIMEOUT = 1.0
 """s without a state after which the hand counts as not answering."""
 _FIRST_STATE_TIMEOUT = 2.0

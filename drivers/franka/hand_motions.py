@@ -28,22 +28,6 @@ from typing import NamedTuple, TypeAlias
 from hal.errors import Fault
 from hal.types import GripperOutcome
 
-__all__ = [
-    "CallAnswer",
-    "CommandResult",
-    "EndedCall",
-    "GraspCommand",
-    "GripperCall",
-    "HandCommand",
-    "HandAction",
-    "HandController",
-    "HandState",
-    "HomeCommand",
-    "WidthCommand",
-    "WidthRange",
-    "is_holding",
-]
-
 _CLOSED = 0.001
 """Width below which the fingers hold nothing, whatever the hand reports, m."""
 _SHUT = 0.0005

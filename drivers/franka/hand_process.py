@@ -24,8 +24,6 @@ from hal.host.process import Channel, Child, SharedMemory, unpack_error
 from .faults import HAND_PORT, fault_of_exception
 from .hand_motions import CallAnswer, HandState
 
-__all__ = ["HandLink", "LinkEvent", "LinkLost", "main"]
-
 _TARGET = "hal.drivers.franka.hand_process:main"
 _OPEN_TIMEOUT = 8.0
 """Longest time for the first connection, including the start of the process, s."""

@@ -1,60 +1,21 @@
-"""Published limits of Franka's arms: joints and Cartesian motion of the FR3 and of the Panda (FER), with sources.
+"""Published limits of Franka's arms: the joints of the FR3 and of the Panda (FER), with sources.
 
 Sources, all in the repository frankarobotics/docs, as of 2026-05: the page "Robot and interface specifications"
-(``source/control_parameters.rst``: conditions, Cartesian limits, the formula for the FR3's joint speeds) and its tables
-``control-parameters-joint-fr3.csv``, ``control-parameters-joint-fr3-rectangular.csv`` and
-``control-parameters-joint-fer.csv``. A command beyond one of them ends a motion with a reflex.
+(``source/control_parameters.rst``: conditions, the formula for the FR3's joint speeds) and its tables
+``control-parameters-joint-fr3.csv`` and ``control-parameters-joint-fer.csv``. A command beyond one of them ends a
+motion with a reflex.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import sqrt
-
-__all__ = [
-    "ELBOW_FLIP",
-    "FER",
-    "FR3",
-    "FR3_BEFORE_5_9",
-    "LIMITS",
-    "ArmLimits",
-    "CartesianLimits",
-    "Derivatives",
-    "Rectangle",
-]
 
 Seven = tuple[float, float, float, float, float, float, float]
 
 ELBOW_FLIP = -0.467002423653011
 """Angle of joint 4 at which the arm is fully stretched, rad; the sign of the elbow changes there."""
-
-
-@dataclass(frozen=True)
-class Derivatives:
-    """Limits of one Cartesian quantity: velocity, acceleration and jerk, in m or rad and s."""
-
-    velocity: float
-    acceleration: float
-    jerk: float
-
-
-@dataclass(frozen=True)
-class CartesianLimits:
-    """Limits of the tcp and of the elbow angle (joint 3)."""
-
-    translation: Derivatives
-    rotation: Derivatives
-    elbow: Derivatives
-
-
-@dataclass(frozen=True)
-class Rectangle:
-    """A box of joint positions, rad, with constant speed limits inside it, rad/s."""
-
-    lower: Seven
-    upper: Seven
-    velocity: Seven
 
 
 @dataclass(frozen=True)
@@ -70,13 +31,9 @@ class ArmLimits:
     torque: Seven
     torque_rate: Seven
     """Nm/s"""
-    cartesian: CartesianLimits
     velocity_offset: Seven | None = None
     """Speed limit near the stops, together with ``deceleration`` (rad/s2); None for an arm without that rule."""
     deceleration: Seven | None = None
-    rectangle: Rectangle | None = None
-    """Franka's suggestion for planners that support constant limits only. In the corners of the box its speeds exceed
-    :meth:`velocity_range`, so somewhat lower speeds are needed."""
 
     def velocity_range(self, q: Sequence[float]) -> tuple[list[float], list[float]]:
         """Return the lowest (7,) and highest (7,) joint velocity at joint positions ``q`` (7,), rad/s.
@@ -108,27 +65,10 @@ FR3 = ArmLimits(
     jerk=(5000.0,) * 7,
     torque=_TORQUE,
     torque_rate=_TORQUE_RATE,
-    cartesian=CartesianLimits(
-        translation=Derivatives(3.0, 9.0, 4500.0),
-        rotation=Derivatives(2.5, 17.0, 8500.0),
-        elbow=Derivatives(2.62, 10.0, 5000.0),
-    ),
     velocity_offset=(0.6599, 0.2517, 0.2000, 0.3533, 0.5757, 0.4878, 0.4628),
     deceleration=(6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0),
-    rectangle=Rectangle(
-        lower=(-2.3476, -1.5454, -2.4937, -2.7714, -2.5100, 0.7773, -2.7045),
-        upper=(2.3476, 1.5454, 2.4937, -0.4226, 2.5100, 4.2841, 2.7045),
-        velocity=(2.0, 1.0, 1.5, 1.25, 3.0, 1.5, 3.0),
-    ),
 )
 """Franka Research 3 with system version 5.9.0 or later."""
-
-FR3_BEFORE_5_9 = replace(
-    FR3,
-    lower=(-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159),
-    upper=(2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159),
-)
-"""FR3 with an older system version. The positions are the constants of panda-python; the rest is as above."""
 
 FER = ArmLimits(
     model="fer",
@@ -139,11 +79,6 @@ FER = ArmLimits(
     jerk=(7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0),
     torque=_TORQUE,
     torque_rate=_TORQUE_RATE,
-    cartesian=CartesianLimits(
-        translation=Derivatives(1.7, 13.0, 6500.0),
-        rotation=Derivatives(2.5, 25.0, 12500.0),
-        elbow=Derivatives(2.175, 10.0, 5000.0),
-    ),
 )
 """Franka Emika Robot: the Panda."""
 

@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 
 from .settings import ArmSettings
 
-__all__ = ["ArmLink", "ArmMode", "ArmSample", "StreamKind"]
-
 Floats = Sequence[float]
 
 

@@ -26,18 +26,6 @@ from typing import NamedTuple
 
 from hal.lock import DeviceLock
 
-__all__ = [
-    "NotMeasured",
-    "PortState",
-    "RoundTrips",
-    "Route",
-    "lock_arm",
-    "measure_round_trips",
-    "probe_port",
-    "resolve_host",
-    "route_to",
-]
-
 
 def lock_arm(host: str) -> DeviceLock:
     """Reserve the arm at ``host`` for this process.

@@ -9,8 +9,6 @@ from panda_py import libfranka
 
 from .link import ArmLink, ArmSample, Floats, StreamKind
 
-__all__ = ["PandaLink"]
-
 _NO_FILTER = 1000.0
 """Cut-off that disables the library's low-pass filter, Hz: the servo's set-points are smooth already."""
 

@@ -40,8 +40,6 @@ from .network import (
 )
 from .settings import ArmSettings, HandSettings
 
-__all__ = ["check", "main", "rate_round_trips"]
-
 PATIENCE = 5.0
 """s for the robot to answer, including the start of the process that connects to it; it needs a fraction of that."""
 _PORT_ERRORS = {PortState.REFUSED: REFUSED, PortState.SILENT: UNREACHABLE, PortState.NO_ROUTE: NO_ROUTE}

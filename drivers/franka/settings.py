@@ -9,29 +9,18 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from hal.config.files import Problems, validate
+from hal.config.files import DeviceSettings
+from hal.config.models import UNITS
 from hal.config.schema import Offset, PoseConfig, Size, Strict, ValueProblem, describe, is_number
-from hal.errors import ConfigError
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import Floats, GripperSpec, RobotSpec
 
 from .limits import LIMITS, ArmLimits
-
-__all__ = [
-    "ArmSettings",
-    "CollisionBehavior",
-    "FrameSetting",
-    "HandSettings",
-    "LoadSetting",
-    "check_arm",
-    "check_hand",
-    "is_emulated",
-]
 
 _NO_ADDRESS = (
     "is missing: the robot's address, as Desk shows it; pass it with --set KEY=ADDRESS (overrides= of hal.open), "
@@ -73,14 +62,6 @@ def _each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-_UNITS = {
-    "lower": "rad",
-    "upper": "rad",
-    "velocity": "rad/s",
-    "acceleration": "rad/s2",
-    "jerk": "rad/s3",
-    "torque": "Nm",
-}
 _ANY = 1e4
 """Largest threshold, Nm or N. One beyond every force of the arm switches the detection off."""
 Host = Annotated[str, BeforeValidator(_host)]
@@ -176,7 +157,7 @@ class LoadSetting(Strict):
         return self.mass, list(self.com), self._tensor().ravel().tolist()
 
 
-class ArmSettings(Strict):
+class ArmSettings(DeviceSettings):
     """Settings under ``real:`` of an arm."""
 
     host: Host
@@ -196,34 +177,13 @@ class ArmSettings(Strict):
     stiffness_frame: FrameSetting | None = None
     """EE_T_K: the stiffness frame in the end effector's frame, m."""
 
-    @classmethod
-    def of(cls, spec: RobotSpec) -> ArmSettings:
-        """Return the settings in an arm's record. Raises ConfigError, which lists every problem."""
-        return _of(cls, spec.options, f"robots.{spec.name}.real")
 
-
-class HandSettings(Strict):
+class HandSettings(DeviceSettings):
     """Settings under ``real:`` of a gripper; the host defaults to the arm's."""
 
     host: Host
     tolerance: Size = 0.002
     """Largest distance from the target width at which the fingers count as arrived, m."""
-
-    @classmethod
-    def of(cls, spec: GripperSpec) -> HandSettings:
-        """Return the settings in a gripper's record. Raises ConfigError, which lists every problem."""
-        return _of(cls, spec.options, f"{spec.name}.real")
-
-
-_Settings = TypeVar("_Settings", bound=BaseModel)
-
-
-def _of(model: type[_Settings], options: Mapping[str, Any], where: str) -> _Settings:
-    problems = Problems()
-    settings = validate(model, options, where, problems)
-    if problems.found:
-        raise ConfigError(problems.found)
-    return settings
 
 
 def is_emulated(options: Mapping[str, Any]) -> bool:
@@ -242,7 +202,7 @@ def libraries(spec: RobotSpec | GripperSpec) -> tuple[str, ...]:
 
 def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
     """Yield the problems in an arm's record: key in the arm's entry of the rig file, message and code."""
-    yield from _check_options(ArmSettings, spec.options)
+    yield from _check_options(ArmSettings, spec)
     limits = LIMITS.get(str(spec.options.get("arm")))
     if len(spec.joints) != 7:
         yield "model", f"must have 7 joints for a Franka arm, not {len(spec.joints)}", "wrong_count"
@@ -254,22 +214,19 @@ def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
 
 def check_hand(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
     """Yield the problems in a hand's record: key in the gripper's entry of the rig file, message and code."""
-    yield from _check_options(HandSettings, spec.options)
+    yield from _check_options(HandSettings, spec)
 
 
-def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    problems = Problems()
-    validate(model, options, "", problems, "real")
-    for problem in problems.found:
-        missing = problem.key == "real.host" and "host" not in options
-        message = _NO_ADDRESS if missing else problem.message
-        yield problem.key, message, problem.code
+def _check_options(model: type[DeviceSettings], spec: RobotSpec | GripperSpec) -> Iterator[tuple[str, str, str]]:
+    for key, message, code in model.check(spec)[1]:
+        missing = key == "real.host" and "host" not in spec.options
+        yield key, _NO_ADDRESS if missing else message, code
 
 
 def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, str, str]]:
     """Yield every limit of the servo that exceeds Franka's; ``allow_looser_limits`` does not change that."""
     name = official.model.upper()
-    for kind, unit in _UNITS.items():
+    for kind, unit in UNITS.items():
         ours: Floats | None = getattr(spec.limits, kind)
         wrong = [
             f"{joint} has {value:g}, beyond {limit:g}"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from hal.registry import DriverSpec
 
-__all__ = ["DRIVER"]
-
 DRIVER = DriverSpec(
     name="playback",
     gamepad="hal.drivers.playback.pad:PlaybackPad",

@@ -21,8 +21,6 @@ from hal.pads.mapper import AxisRange
 
 from .pad import PadRecording, RecordedEvent, dump_recording
 
-__all__ = ["convert", "main"]
-
 _EVENT = re.compile(r"E: (\d+\.\d+) ([0-9a-fA-F]{4}) ([0-9a-fA-F]{4}) (-?\d+)")
 _RANGE = re.compile(r"A: ([0-9a-fA-F]{2}) (-?\d+) (-?\d+) (-?\d+) (-?\d+)")
 _IOCTL = re.compile(r"EVIOCGABS(?:\((\d+)\))? 0 ([0-9a-fA-F]{48})")

@@ -30,8 +30,6 @@ from hal.pads.mapper import AxisRange, PadMapper
 from hal.pads.model import PadModel, check_record, pad_model
 from hal.specs import PadSpec
 
-__all__ = ["PadRecording", "PlaybackPad", "RecordedEvent", "check", "dump_recording", "load_recording"]
-
 Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 _WORLD_POLL = 0.002

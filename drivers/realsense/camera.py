@@ -20,8 +20,6 @@ from hal.specs import CameraSpec, to_json
 
 from .options import RealSenseSettings
 
-__all__ = ["RealSenseCamera"]
-
 if importlib.util.find_spec("pyrealsense2") is None:  # this process does without it, the camera's own does not
     raise ModuleNotFoundError("No module named 'pyrealsense2'", name="pyrealsense2")
 
@@ -64,7 +62,7 @@ class RealSenseCamera(CameraDriver):
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
         """Check the options; raises ConfigError."""
         super().__init__(spec, source)
-        self._settings = RealSenseSettings.from_spec(spec)
+        self._settings = RealSenseSettings.of(spec)
         played = self._settings.play is not None
         self.on_demand = played and not self._settings.paced
         self._silence = max(self._settings.stall_s, _PLAYED_STALL if played else 0.0, 3.0 / spec.rate_hz) + _MARGIN

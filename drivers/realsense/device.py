@@ -26,8 +26,6 @@ from .options import RealSenseSettings, apply_options, find_sensors, has_auto_ex
 from .pipeline import FramePipeline, LivePipeline, PlaybackPipeline, choose_profiles, describe_optics
 from .streaming import FrameStreamer
 
-__all__ = ["ConnectedCamera", "RealSenseDevice", "RecordingFiles", "find_camera", "find_cameras", "lock_camera"]
-
 _FIRST_SET = 3.0
 """s that a camera may take to send its first frame set after a start."""
 _RESTART_WARM_UP = 0.3
@@ -52,7 +50,7 @@ class RealSenseDevice:
             notify: Called with news (``frame``: a number; ``lost``: a packed error) from the streaming thread.
         """
         self._spec = spec
-        self._settings = RealSenseSettings.from_spec(spec)
+        self._settings = RealSenseSettings.of(spec)
         self._ring = ring
         self._notify = notify
         self._context, self._emulated = self._create_context(spec)

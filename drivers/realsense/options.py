@@ -14,22 +14,10 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from hal.config.files import Problems, validate
-from hal.config.schema import Flag, Quantity, Seconds, Strict, ValueProblem, describe, is_number
-from hal.errors import CommandError, ConfigError, NotSupported
+from hal.config.files import DeviceSettings
+from hal.config.schema import Flag, Quantity, Seconds, ValueProblem, describe, is_number
+from hal.errors import CommandError, NotSupported
 from hal.specs import CameraSpec
-
-__all__ = [
-    "COLOR_FORMATS",
-    "FORMATS",
-    "RealSenseSettings",
-    "Sensors",
-    "apply_options",
-    "find_sensors",
-    "has_auto_exposure",
-    "problems",
-    "read_options",
-]
 
 COLOR_FORMATS = ("rgb8", "bgr8", "rgba8", "bgra8", "yuyv", "uyvy")
 """Colour formats that are converted to RGB, the cheapest first."""
@@ -100,7 +88,7 @@ def _check_emulated(value: Any) -> Any:
     return {} if value is True else dict(value)
 
 
-class RealSenseSettings(Strict):
+class RealSenseSettings(DeviceSettings):
     """``real:`` of a RealSense."""
 
     serial: Annotated[str | None, BeforeValidator(_check_serial)] = None
@@ -144,15 +132,6 @@ class RealSenseSettings(Strict):
         """Whether the frames come from a connected camera."""
         return self.play is None and self.emulated is None
 
-    @classmethod
-    def from_spec(cls, spec: CameraSpec) -> RealSenseSettings:
-        """Return the settings in a camera's record. Raises ConfigError, which lists every problem."""
-        found = Problems()
-        settings = validate(cls, spec.options, f"cameras.{spec.name}.real", found)
-        if found.found:
-            raise ConfigError(found.found)
-        return settings
-
 
 def problems(spec: CameraSpec) -> Iterator[tuple[str, str, str]]:
     """Check a camera's record.
@@ -160,17 +139,12 @@ def problems(spec: CameraSpec) -> Iterator[tuple[str, str, str]]:
     Yields:
         Key in the camera's entry of the rig file (``real.serial``), message and code.
     """
-    found = Problems()
-    validate(RealSenseSettings, spec.options, "", found, "real")
-    for problem in found.found:
-        yield problem.key, problem.message, problem.code
-    played = spec.options.get("play")
-    if isinstance(played, str) and not found.found and not Path(played).expanduser().is_file():
-        yield "real.play", f"there is no recording {played}", "missing_file"
-    recorded = spec.options.get("record")
-    if isinstance(recorded, str) and not found.found and not Path(recorded).expanduser().parent.is_dir():
-        folder = Path(recorded).expanduser().parent
-        yield "real.record", f"there is no folder {folder} for the recording", "missing_folder"
+    settings, found = RealSenseSettings.check(spec)
+    yield from found
+    if settings is not None and settings.play is not None and not Path(settings.play).is_file():
+        yield "real.play", f"there is no recording {settings.play}", "missing_file"
+    if settings is not None and settings.record is not None and not Path(settings.record).parent.is_dir():
+        yield "real.record", f"there is no folder {Path(settings.record).parent} for the recording", "missing_folder"
     for stream in spec.streams:
         formats = FORMATS.get(stream)
         if formats is None:

@@ -20,17 +20,6 @@ from hal.specs import CameraSpec, SensorSpec
 
 from .options import FORMATS
 
-__all__ = [
-    "FramePipeline",
-    "LensModel",
-    "LivePipeline",
-    "PlaybackPipeline",
-    "choose_profiles",
-    "convert_extrinsics",
-    "convert_intrinsics",
-    "describe_optics",
-]
-
 Array = NDArray[np.float64]
 
 _QUEUE = 4

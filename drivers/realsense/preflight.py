@@ -13,8 +13,6 @@ from hal.specs import CameraSpec
 
 from .camera import RealSenseCamera
 
-__all__ = ["preflight"]
-
 _GRAB = 0.2
 """s that one wait for a frame takes at most."""
 _SETTLE = 5.0

@@ -23,8 +23,6 @@ from hal.specs import CameraSpec, from_json
 
 from .device import RealSenseDevice, find_cameras
 
-__all__ = ["list_plugged", "main"]
-
 _NICE = 5
 """Frames have a lower priority than the servo."""
 _CHECK = 0.5

@@ -27,22 +27,6 @@ from hal.specs import CameraSpec
 
 from .pipeline import FramePipeline
 
-__all__ = [
-    "GLOBAL",
-    "HARDWARE",
-    "SYSTEM",
-    "CaptureNumbers",
-    "CaptureTimes",
-    "ClockUnwrapper",
-    "FrameConverter",
-    "FrameMatch",
-    "FrameMatcher",
-    "FrameStamp",
-    "FrameStreamer",
-    "StreamStart",
-    "measure_skew",
-]
-
 # Capture times.
 #
 # A stamp is on one of three clocks (rs2_timestamp_domain). For the first two the host's time of day is available, and

@@ -12,8 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from hal.pads.keyboard import keyboard_table
 from hal.types import AXES
 
-__all__ = ["HELP", "RELEASED", "STOP_KEYS", "PadControls", "StepControls", "TerminalOptions"]
-
 _TABLE = keyboard_table("terminal")
 STOP_KEYS = _TABLE.stop
 """Keys that stop every arm. A terminal reports Esc alone with a short delay."""

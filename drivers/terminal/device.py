@@ -13,8 +13,6 @@ from typing import Any
 
 from hal.errors import NotSupported
 
-__all__ = ["Terminal"]
-
 _JOB_CONTROL = (signal.SIGTTIN, signal.SIGTTOU)
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from types import MappingProxyType
 
-__all__ = ["KeyParser"]
-
 _ESC = 0x1B
 _SEQUENCE = re.compile(rb"\x1b(?:\[([0-?]{0,32})|O)([@-~])")
 _BEGUN = re.compile(rb"\x1b(?:\[[0-?]{0,32}|O)?")

@@ -15,8 +15,6 @@ from .controls import HELP, RELEASED, STOP_KEYS, PadControls, StepControls, Term
 from .device import Terminal
 from .keys import KeyParser
 
-__all__ = ["TerminalPad"]
-
 
 class TerminalPad(GamepadDriver):
     """Keys of a terminal as a gamepad. ``source``, if callable, stops every arm; Backspace and Esc call it.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from hal.registry import DriverSpec
 
-__all__ = ["DRIVER"]
-
 DRIVER = DriverSpec(
     name="viser",
     viewer3d="hal.drivers.viser.viewer:ViserViewer",

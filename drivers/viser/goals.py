@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 from hal.geometry import Pose
 
-__all__ = ["FARTHEST", "REACHED_ANGLE", "REACHED_DISTANCE", "UNUSED", "HandleDrag", "DraggedGoal", "checked_pose"]
-
 REACHED_DISTANCE, REACHED_ANGLE = 0.002, 0.01
 """Distances of the tcp at which a goal counts as reached, m and rad."""
 UNUSED = 10.0

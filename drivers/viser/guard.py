@@ -24,8 +24,6 @@ from websockets.http11 import Request, Response
 from hal.auth import Authenticator
 from hal.errors import HalError
 
-__all__ = ["HOST", "GuardedServer", "start_server"]
-
 HOST = "127.0.0.1"
 _REFUSED = "This page opens only by the link that the program printed.\n"
 

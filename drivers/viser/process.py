@@ -26,8 +26,6 @@ from hal.types import Limited, Trip
 from .guard import HOST, start_server
 from .scene import ArmView, BodiesView
 
-__all__ = ["PORT", "StatusPanel", "ViewerPage", "arm_status", "main"]
-
 PORT = 8080
 """The first port to try."""
 _NICE = 10
@@ -117,7 +115,10 @@ class ViewerPage:
                     raise HalError(f"{robot.name} cannot be drawn: {error}", code="not_drawable") from error
             if group.world is not None:
                 snapshots = SeriesBox(shared.buffer[GroupMemory.size_of(group) :], SNAPSHOT_CAPACITY)
-                self.world = BodiesView(server.scene, group.world, snapshots, self.notes)
+                try:
+                    self.world = BodiesView(server.scene, group.world, snapshots, self.notes)
+                except HalError as error:
+                    self.notes.append(f"the world is not drawn: {error}")
         self.arms = [arm for arm, _ in arms]
         if not any(group.world is not None and _has_floor(group.world) for group in groups):
             server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
@@ -159,18 +160,15 @@ class ViewerPage:
         """Read the states of the arms, and show them if a page is open."""
         for arm in self.arms:
             arm.read_state()
-        if not self.watched:
-            if self.world is not None and self.world.behind:
-                self.world.update()
-            return
-        now = time.monotonic()
+        watched, now = self.watched, time.monotonic()
         with self._server.atomic():
-            for arm in self.arms:
+            for arm in self.arms if watched else ():
                 arm.update()
             if self.world is not None and now >= self._due:
                 self._due = now + _WORLD_PERIOD
-                self.world.update()
-        self._panel.update()
+                self.world.update(watched=watched)
+        if watched:
+            self._panel.update()
 
 
 class StatusPanel:

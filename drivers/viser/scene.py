@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
-from hal.drivers.scene.drawn import DrawnWorld
+from hal.drivers.scene.drawn import DrawnBody, DrawnWorld
+from hal.drivers.scene.mirror import WorldMirror
+from hal.drivers.scene.shapes import Visual
 from hal.drivers.scene.urdf_files import absent_packages, drawn_visuals, where_to_get
-from hal.errors import HalError
-from hal.geometry import Pose
+from hal.geometry import Pose, matrix_to_quaternion
 from hal.host.memory import SeriesBox
 from hal.host.records import GripperMail, RobotMail
-from hal.kinematics.urdf import UrdfJoint, UrdfModel, UrdfVisual, read_urdf
+from hal.kinematics.urdf import UrdfJoint, UrdfModel, read_urdf
 from hal.servo.watchdog import PAD_SILENCE
-from hal.specs import BodySpec, RobotSpec, WorkspaceSpec, WorldSpec, from_json
+from hal.specs import BodySpec, RobotSpec, WorkspaceSpec, WorldSpec
 from hal.types import RobotState, Trip
 
 from .goals import HandleDrag
-from .meshes import visual_glb
+from .meshes import visuals_glb
 
-__all__ = ["ArmView", "BodiesView", "shown_visuals", "workspace_lines"]
+Vector = Sequence[float] | NDArray[np.float64]
 
 _OPEN_SIDE = 0.8
 """Distance from the base at which an open side of a workspace is drawn, m."""
 _AMBER = (230, 150, 30)
+_WHITE = (1.0, 1.0, 1.0, 1.0)
 _AT_REST = 1e-5
 """A node that moves by less is not updated, m and parts of a quaternion: an arm at rest costs no messages."""
 
@@ -162,7 +163,7 @@ def _draw_links(
         node = scene.add_frame(path, show_axes=False, position=np.array(position), wxyz=_wxyz(orientation))
         if joint.movable:
             moving.append((joint, node))
-    for name, visuals in shown_visuals(urdf, notes).items():
+    for name, visuals in shown_visuals(urdf, spec.name, notes).items():
         _draw_visuals(scene, paths[name], visuals, notes)
     return moving
 
@@ -190,108 +191,68 @@ def workspace_lines(workspace: WorkspaceSpec) -> NDArray[np.float32]:
 
 
 class BodiesView:
-    """All bodies of a simulated world, drawn from their specs and moved by a mirror of the world.
-
-    Bodies that can move are left out if a file of the world's record is broken.
-    """
+    """All bodies of a simulated world, drawn and posed as its cameras show them."""
 
     def __init__(self, scene: SceneApi, spec: WorldSpec, snapshots: SeriesBox, notes: list[str]) -> None:
-        """Draw the bodies of ``spec``; ``notes`` gets a line for everything that cannot be drawn."""
+        """Draw the bodies of ``spec``; ``notes`` gets a line for everything that cannot be drawn.
+
+        Raises:
+            HalError: A file of the world's record is broken.
+        """
         self._scene = scene
-        self._snapshots = snapshots
         self._notes = notes
-        self._mirror = _mirror(spec, notes)
-        self._specs: dict[str, BodySpec] = {}
-        self._links: dict[str, dict[str | None, SceneNodeHandle]] = {}
-        self._edits: dict[int, tuple[str, Mapping[str, Any]]] = {}
-        self._number = 0
-        for body in spec.bodies:
-            self._draw(body)
+        self._world = DrawnWorld(spec)
+        self._mirror = WorldMirror(self._world, snapshots)
+        self._revision = -1
+        self._drawn: dict[str, tuple[DrawnBody, tuple[Visual, ...], list[SceneNodeHandle]]] = {}
+        """Name of a body -> the body, its shapes as they are drawn, and the frames of its links."""
+        notes += self._world.notes
+        self._show()
 
-    def note_edit(self, method: str, params: Mapping[str, Any], revision: int) -> None:
+    def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Note an edit of the world; it is repeated here before the first snapshot of its revision is shown."""
-        if self._mirror is not None:
-            self._edits[revision] = (method, params)
+        self._mirror.edited(method, params, revision)
 
-    @property
-    def behind(self) -> bool:
-        """Whether there are edits that are not repeated yet."""
-        return bool(self._edits)
+    def update(self, *, watched: bool) -> None:
+        """Follow the world, and update the page if one is open."""
+        if self._mirror.update() is not None and watched:
+            self._show()
 
-    def update(self) -> None:
-        """Update the page."""
-        record = self._snapshots.read()
-        if self._mirror is None or record is None or record[0] == self._number:
-            return
-        number, _, revision, values = record
-        while self._mirror.revision < revision:
-            edit = self._edits.pop(self._mirror.revision + 1, None)
-            if edit is None:
-                return  # snapshots come through memory and may overtake edits, which come through a socket
-            self._mirror.request(*edit)
-            self._repeat_edit(*edit)
-        try:
-            self._mirror.show(values)
-        except ValueError:
-            return  # of a world that was edited since
-        self._number = number
-        for name, links in self._links.items():
-            for link, node in links.items():
-                pose = self._mirror.pose(name, link)
-                _move_node(node, pose["position"], pose["orientation"])
+    def _show(self) -> None:
+        if self._revision != self._world.revision:
+            self._revision = self._world.revision
+            self._draw_changes()
+        for body, _, nodes in self._drawn.values():
+            frames = self._world.link_frames([(body.id, link) for link in range(len(nodes))])
+            for node, frame in zip(nodes, frames, strict=True):
+                _move_node(node, frame[:3, 3], matrix_to_quaternion(frame[:3, :3]))
 
-    def _repeat_edit(self, method: str, params: Mapping[str, Any]) -> None:
-        if method == "add":
-            self._draw(from_json(BodySpec, params["spec"]))
-        elif method == "remove":
-            self._erase(params["name"])
-        elif method == "set_color" and params["name"] in self._specs:
-            body = replace(self._specs[params["name"]], rgba=tuple(params["rgba"]))
-            self._erase(body.name)
-            self._draw(body, painted=True)
+    def _draw_changes(self) -> None:
+        """Draw the bodies that are new or look different, and remove those that are gone."""
+        bodies = {name: body for name, body in self._world.bodies.items() if isinstance(body.spec, BodySpec)}
+        for name, (body, visuals, _) in tuple(self._drawn.items()):
+            if bodies.get(name) is not body or body.visuals is not visuals:
+                del self._drawn[name]
+                self._scene.remove_by_name(f"/bodies/{name}")
+        for name, body in bodies.items():
+            if name not in self._drawn and body.spec.visible:
+                self._drawn[name] = body, body.visuals, self._draw(body)
 
-    def _erase(self, name: str) -> None:
-        self._specs.pop(name, None)
-        if self._links.pop(name, None) is not None:
-            self._scene.remove_by_name(f"/bodies/{name}")
-
-    def _draw(self, body: BodySpec, *, painted: bool = False) -> None:
-        """Draw a body; ``painted`` if its colour replaces those of its files."""
-        self._specs[body.name] = body
-        if not body.visible or (self._mirror is None and not body.fixed):
-            return
-        base = Pose(body.position, body.orientation)
+    def _draw(self, body: DrawnBody) -> list[SceneNodeHandle]:
+        """Draw a body; return the frames of its links."""
         root = f"/bodies/{body.name}"
-        if body.shape == "plane":
-            self._scene.add_grid(root, 6.0, 6.0, cell_size=0.25, position=base.position, wxyz=_wxyz(base.orientation))
-            return
-        links = self._links[body.name] = {}
-        self._scene.add_frame(root, show_axes=False)
-        for number, (link, pose, visuals) in enumerate(self._parts(body, painted=painted)):
-            at = base @ pose
-            path = f"{root}/{number}"
-            links[link] = self._scene.add_frame(path, show_axes=False, position=at.position, wxyz=_wxyz(at.orientation))
-            _draw_visuals(self._scene, path, visuals, self._notes)
-
-    def _parts(self, body: BodySpec, *, painted: bool) -> list[tuple[str | None, Pose, list[UrdfVisual]]]:
-        """Return each link (None for the base link) with its pose in the body's frame, and its visuals."""
-        if body.urdf is None:
-            return [(None, Pose(), [_primitive(body)])]
-        try:
-            urdf = _read_urdf(body.urdf)
-        except (OSError, ValueError) as error:
-            self._notes.append(f"not drawn: {error}")
-            return []
-        rgba = body.rgba if painted else None
-        visuals = shown_visuals(urdf, self._notes)
-        return [
-            (
-                None if link == urdf.root else link,
-                _scaled(pose, body.scale),
-                [_scaled_visual(visual, body.scale, rgba) for visual in visuals[link]],
+        if body.spec.shape == "plane":
+            self._scene.add_grid(
+                root, 6.0, 6.0, cell_size=0.25, position=body.spec.position, wxyz=_wxyz(body.spec.orientation)
             )
-            for link, pose in urdf.poses({}).items()
-        ]
+            return []
+        self._scene.add_frame(root, show_axes=False)
+        nodes = []
+        for link in range(len(body.links)):
+            nodes.append(self._scene.add_frame(f"{root}/{link}", show_axes=False))
+            shapes = [visual for visual in body.visuals if visual.link == link]
+            _draw_visuals(self._scene, f"{root}/{link}", shapes, self._notes)
+        return nodes
 
 
 def _read_urdf(path: str) -> UrdfModel:
@@ -302,56 +263,35 @@ def _read_urdf(path: str) -> UrdfModel:
         raise ValueError(f"{path}: {error}") from None
 
 
-def shown_visuals(urdf: UrdfModel, notes: list[str]) -> dict[str, tuple[UrdfVisual, ...]]:
+def shown_visuals(urdf: UrdfModel, name: str, notes: list[str]) -> dict[str, list[Visual]]:
     """Return what is drawn of each link, with a note for each package of meshes that is not installed."""
     absent = absent_packages(str(urdf.path))
-    if not absent:
-        return {name: link.visuals for name, link in urdf.links.items()}
-    notes += [f"{urdf.path.name}: drawn with plain shapes; its meshes are in {where_to_get(name)}" for name in absent]
-    return {name: drawn_visuals(link) for name, link in urdf.links.items()}
+    notes += [f"{name}: drawn with plain shapes; the meshes are in {where_to_get(package)}" for package in absent]
+    return {
+        key: [
+            Visual(
+                0,
+                shape.shape,
+                shape.size,
+                shape.file,
+                tuple(shape.pose.position),
+                tuple(shape.pose.orientation),
+                shape.rgba or _WHITE,
+            )
+            for shape in (drawn_visuals(link) if absent else link.visuals)
+        ]
+        for key, link in urdf.links.items()
+    }
 
 
-def _mirror(spec: WorldSpec, notes: list[str]) -> DrawnWorld | None:
-    """Return a copy of the world that snapshots pose; None where a file of its record is broken."""
-    try:
-        return DrawnWorld(spec)
-    except HalError as error:
-        if any(not body.fixed for body in spec.bodies):
-            notes.append(f"bodies that can move are not drawn: {error}")
-        return None
+def _draw_visuals(scene: SceneApi, parent: str, visuals: Sequence[Visual], notes: list[str]) -> None:
+    """Draw the visual shapes of a link in its frame; ``notes`` gets a line for each that cannot be drawn."""
+    data = visuals_glb(visuals, notes)
+    if data:
+        scene.add_glb(f"{parent}/visual", data)
 
 
-def _primitive(body: BodySpec) -> UrdfVisual:
-    radius, length = body.radius or 0.0, body.length or 0.0
-    size = {
-        "box": tuple(2.0 * half for half in body.half_extents or ()),
-        "sphere": (radius,),
-    }.get(body.shape, (radius, length))
-    return UrdfVisual(Pose(), body.shape, size, body.rgba)
-
-
-def _scaled_visual(visual: UrdfVisual, scale: float, rgba: tuple[float, ...] | None) -> UrdfVisual:
-    size = tuple(scale * part for part in visual.size)
-    return replace(visual, pose=_scaled(visual.pose, scale), size=size, rgba=rgba or visual.rgba)
-
-
-def _scaled(pose: Pose, scale: float) -> Pose:
-    return Pose(scale * pose.position, pose.orientation)
-
-
-def _draw_visuals(scene: SceneApi, parent: str, visuals: Iterable[UrdfVisual], notes: list[str]) -> None:
-    """Draw visuals as children of a node; ``notes`` gets a line for each that cannot be drawn."""
-    for number, visual in enumerate(visuals):
-        try:
-            data = visual_glb(visual)
-        except ValueError as error:
-            notes.append(f"not drawn: {error}")
-            continue
-        pose = visual.pose
-        scene.add_glb(f"{parent}/visual{number}", data, position=pose.position, wxyz=_wxyz(pose.orientation.tolist()))
-
-
-def _move_node(node: SceneNodeHandle, position: Sequence[float], orientation: Sequence[float]) -> None:
+def _move_node(node: SceneNodeHandle, position: Vector, orientation: Vector) -> None:
     """Set the pose of a node in its parent's frame, unless it is there already; orientation x, y, z, w."""
     at, turn = np.asarray(position, float), np.asarray(_wxyz(orientation))
     if not _alike(node.position, at):
@@ -364,7 +304,7 @@ def _alike(present: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
     return bool(np.abs(present - wanted).max() <= _AT_REST)
 
 
-def _wxyz(orientation: Sequence[float] | NDArray[np.float64]) -> tuple[float, float, float, float]:
+def _wxyz(orientation: Vector) -> tuple[float, float, float, float]:
     """Return a quaternion x, y, z, w in viser's order."""
     x, y, z, w = map(float, orientation)
     return w, x, y, z

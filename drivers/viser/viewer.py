@@ -22,8 +22,6 @@ from .goals import checked_pose
 if TYPE_CHECKING:
     from hal.rig import Rig
 
-__all__ = ["ViserViewer"]
-
 _SILENCE = 0.5
 """Time after which a goal that is not repeated does not count: its process hangs, or is gone, s."""
 _POLL = 0.05

@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
@@ -29,13 +28,11 @@ from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
 from hal.types import STREAMS, Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
 
-from .messages import ALARMS
+from .messages import ALARMS, Outbox
 from .pad import PadQueue, WebPad, lost_reading, pad_reading
 
 if TYPE_CHECKING:
     from hal.rig import Rig
-
-__all__ = ["ProcessChannel", "WebConsole", "recording_message"]
 
 _TOKEN_BYTES = 18
 _STREAMS = (*(name for name, kind in STREAMS.items() if not kind.exact), "depth")
@@ -157,7 +154,7 @@ class WebConsole(Console):
         self._channel.send("driving", view=asdict(view))
 
     def show_recording(self, view: RecordingView) -> None:
-        self._channel.send_newest("recording", t=time.monotonic(), view=recording_message(view))
+        self._channel.send_newest("recording", "recording", t=time.monotonic(), view=recording_message(view))
 
     def show_camera(self, camera: Camera) -> None:
         spec = next((spec for spec in self._shown if spec.name == camera.name), None)
@@ -171,7 +168,7 @@ class WebConsole(Console):
         layers = {name: getattr(frame, name) for name in spec.streams}
         raw = RawFrame(stamp.t, stamp.t_device, stamp.seq, **layers)
         self._rings[spec.name].write(raw)
-        self._channel.send_frame(spec.name)
+        self._channel.send_newest(f"frame {spec.name}", "frame", camera=spec.name)
 
     # What pages request.
 
@@ -295,9 +292,7 @@ class ProcessChannel:
         self._receive = receive
         self._lost = lost
         self._changed = threading.Condition()
-        self._messages: deque[dict[str, Any]] = deque(maxlen=_MAX_MESSAGES)
-        self._newest: dict[str, dict[str, Any]] = {}
-        self._frames: dict[str, None] = {}
+        self._waiting: Outbox[dict[str, Any]] = Outbox(most=_MAX_MESSAGES)
         self._over = False
         self._threads = [
             threading.Thread(target=self._receive_all, name="hal-console-receive", daemon=True),
@@ -312,33 +307,22 @@ class ProcessChannel:
     def send(self, method: str, **more: Any) -> None:
         """Queue a message; never waits."""
         with self._changed:
-            self._messages.append({"method": method, **more})
+            while not self._waiting.put({"method": method, **more}):
+                self._waiting.pop()
             self._changed.notify()
 
-    def send_newest(self, method: str, **more: Any) -> None:
-        """Queue a message that replaces one of the same method that still waits."""
+    def send_newest(self, kind: str, method: str, **more: Any) -> None:
+        """Queue a message that replaces one of the same kind that still waits. Other messages come first."""
         with self._changed:
-            self._newest[method] = {"method": method, **more}
-            self._changed.notify()
-
-    def send_frame(self, camera: str) -> None:
-        """Announce a new picture of this camera. Two that wait become one, and other messages come first."""
-        with self._changed:
-            self._frames[camera] = None
+            self._waiting.put_newest(kind, {"method": method, **more})
             self._changed.notify()
 
     def _next(self) -> dict[str, Any] | None:
+        message = None
         with self._changed:
-            self._changed.wait_for(lambda: self._messages or self._newest or self._frames or self._over)
-            if self._over:
-                return None
-            if self._messages:
-                return self._messages.popleft()
-            if self._newest:
-                return self._newest.pop(next(iter(self._newest)))
-            camera = next(iter(self._frames))
-            del self._frames[camera]
-            return {"method": "frame", "camera": camera}
+            while not self._over and (message := self._waiting.pop()) is None:
+                self._changed.wait()
+        return message
 
     def _send_all(self) -> None:
         channel = Channel(self._child.channel.sock.dup())  # its own lock: a message that waits must not delay the close
@@ -462,23 +446,11 @@ def recording_message(view: RecordingView) -> dict[str, Any]:
     Raises:
         TypeError, ValueError: A field that must be a number is not one.
     """
-    return {
-        "phase": view.phase,
-        "prompt": _line(view.prompt),
-        "task": _line(view.task),
-        "episode": int(view.episode),
-        "saved": int(view.saved),
-        "wanted": int(view.wanted),
-        "succeeded": int(view.succeeded),
-        "failed": int(view.failed),
-        "discarded": int(view.discarded),
-        "seconds": round(float(view.seconds), 2),
-        "frames": int(view.frames),
-        "dropped": int(view.dropped),
-        "free_bytes": int(view.free_bytes),
-        "trouble": _line(view.trouble),
-        "actions": list(view.actions),
-    }
+    texts = {name: _line(getattr(view, name)) for name in ("prompt", "task", "trouble")}
+    numbers = ("episode", "saved", "wanted", "succeeded", "failed", "discarded", "frames", "dropped", "free_bytes")
+    counts = {name: int(getattr(view, name)) for name in numbers}
+    seconds = round(float(view.seconds), 2)
+    return {"phase": view.phase, **texts, **counts, "seconds": seconds, "actions": list(view.actions)}
 
 
 def _line(text: str) -> str:

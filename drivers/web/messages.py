@@ -1,38 +1,17 @@
-"""The messages that a page may send, checked: text from outside becomes one of these records, or is refused."""
+"""The messages that a page may send, checked: text from outside becomes one of these records, or is refused.
+
+:class:`Outbox` holds the messages that wait to be sent, in all directions.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
-from typing import Any, NamedTuple
+from collections import deque
+from collections.abc import Callable, Collection
+from typing import Generic, NamedTuple, TypeVar
 
 from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
 from hal.views import ACTIONS, FRAMES, SETTINGS
-
-__all__ = [
-    "ALARMS",
-    "CLOCK_AHEAD",
-    "MAX_BYTES",
-    "MESSAGES_LATE",
-    "PAGE_CLOSED",
-    "PAGE_GONE",
-    "PAGE_SILENT",
-    "RELEASE_MISSED",
-    "ControlRequest",
-    "MalformedMessage",
-    "PadMessage",
-    "PageLeft",
-    "PageMessage",
-    "PictureDrawn",
-    "RecordingRequest",
-    "RecoverRequest",
-    "SettingRequest",
-    "StopRequest",
-    "TourRequest",
-    "WatchRequest",
-    "encode",
-    "parse",
-]
 
 MAX_BYTES = 4096
 """Longest message of a page."""
@@ -143,20 +122,6 @@ PageMessage = (
     | PictureDrawn
 )
 
-_KEYS = {
-    "pad": {"type", "seen", "since", "axes", "buttons"},
-    "away": {"type", "why"},
-    "lease": {"type", "take"},
-    "stop": {"type"},
-    "recover": {"type", "robot"},
-    "demo": {"type", "play"},
-    "action": {"type", "action"},
-    "setting": {"type", "name", "value"},
-    "watch": {"type", "cameras"},
-    "drawn": {"type", "camera"},
-}
-"""Type of a message -> exactly its keys."""
-
 encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 """Return a message as JSON text; ValueError for a number that is not finite."""
 
@@ -187,56 +152,59 @@ def parse(text: str, robots: Collection[str] = (), cameras: Collection[str] = ()
         raise MalformedMessage(f"not JSON: {type(error).__name__}") from None
     if not isinstance(data, dict):
         raise MalformedMessage("not an object")
-    kind = data.get("type")
-    keys = _KEYS.get(kind) if isinstance(kind, str) else None
-    if keys is None or data.keys() != keys:
+    kind = data.pop("type", None)
+    keys, make = _MESSAGES.get(kind, (None, None)) if isinstance(kind, str) else (None, None)
+    if make is None or data.keys() != keys:
         raise MalformedMessage("an unknown type, or the wrong keys")
-    return _record(str(kind), data, robots, cameras)
+    return make(_Names(robots, cameras), **data)
 
 
-def _record(kind: str, data: Mapping[str, Any], robots: Collection[str], cameras: Collection[str]) -> PageMessage:
-    if kind == "pad":
-        return _pad_message(data)
-    if kind == "drawn":
-        return PictureDrawn(_one_of(data["camera"], cameras))
-    if kind == "stop":
-        return StopRequest()
-    if kind == "away":
-        return PageLeft(_LEFT[_one_of(data["why"], _LEFT)])
-    if kind == "lease":
-        return ControlRequest(_flag(data["take"]))
-    if kind == "recover":
-        return RecoverRequest(_one_of(data["robot"], robots))
-    if kind == "demo":
-        return TourRequest(_flag(data["play"]))
-    if kind == "action":
-        return RecordingRequest(_one_of(data["action"], ACTIONS))
-    if kind == "setting":
-        return _setting(_one_of(data["name"], SETTINGS), data["value"], robots)
-    names = data["cameras"]
-    if not isinstance(names, list):
-        raise MalformedMessage("not a list of cameras")
-    return WatchRequest(tuple(dict.fromkeys(_one_of(name, cameras) for name in names)))
+class _Names(NamedTuple):
+    """Names that a message may contain."""
+
+    robots: Collection[str]
+    cameras: Collection[str]
 
 
-def _pad_message(data: Mapping[str, Any]) -> PadMessage:
-    axes, buttons = data["axes"], data["buttons"]
+def _pad_message(_: _Names, seen: object, since: object, axes: object, buttons: object) -> PadMessage:
     if not isinstance(axes, list) or len(axes) != len(_RANGES):
         raise MalformedMessage(f"not {len(_RANGES)} axes")
     if type(buttons) is not int or not 0 <= buttons < _MASKS:
         raise MalformedMessage("not a mask of buttons")
     return PadMessage(
-        seen=_number(data["seen"], 0.0, _MAX_TIME),
-        since=_number(data["since"], 0.0, _MAX_TIME) / 1000.0,
+        seen=_number(seen, 0.0, _MAX_TIME),
+        since=_number(since, 0.0, _MAX_TIME) / 1000.0,
         axes=tuple(_number(value, *limits) for value, limits in zip(axes, _RANGES, strict=True)),
         buttons=buttons,
     )
 
 
-def _setting(name: str, value: object, robots: Collection[str]) -> SettingRequest:
+def _setting(known: _Names, name: object, value: object) -> SettingRequest:
+    name = _one_of(name, SETTINGS)
     if name == "speed":
         return SettingRequest(name, _number(value, _MIN_SPEED, 1.0))
-    return SettingRequest(name, _one_of(value, {"robot": robots, "frame": FRAMES, "scene": ("reset",)}[name]))
+    return SettingRequest(name, _one_of(value, {"robot": known.robots, "frame": FRAMES, "scene": ("reset",)}[name]))
+
+
+def _watch(known: _Names, cameras: object) -> WatchRequest:
+    if not isinstance(cameras, list):
+        raise MalformedMessage("not a list of cameras")
+    return WatchRequest(tuple(dict.fromkeys(_one_of(name, known.cameras) for name in cameras)))
+
+
+_MESSAGES: dict[str, tuple[set[str], Callable[..., PageMessage]]] = {
+    "pad": ({"seen", "since", "axes", "buttons"}, _pad_message),
+    "away": ({"why"}, lambda _, why: PageLeft(_LEFT[_one_of(why, _LEFT)])),
+    "lease": ({"take"}, lambda _, take: ControlRequest(_flag(take))),
+    "stop": (set(), lambda _: StopRequest()),
+    "recover": ({"robot"}, lambda known, robot: RecoverRequest(_one_of(robot, known.robots))),
+    "demo": ({"play"}, lambda _, play: TourRequest(_flag(play))),
+    "action": ({"action"}, lambda _, action: RecordingRequest(_one_of(action, ACTIONS))),
+    "setting": ({"name", "value"}, _setting),
+    "watch": ({"cameras"}, _watch),
+    "drawn": ({"camera"}, lambda known, camera: PictureDrawn(_one_of(camera, known.cameras))),
+}
+"""Type of a message -> exactly its other keys, and what makes its record of them."""
 
 
 def _number(value: object, low: float, high: float) -> float:
@@ -258,3 +226,43 @@ def _one_of(value: object, known: Collection[str]) -> str:
     if not isinstance(value, str) or value not in known:
         raise MalformedMessage("an unknown name")
     return value
+
+
+# What waits to be sent.
+
+M = TypeVar("M")
+
+
+class Outbox(Generic[M]):
+    """Messages that wait to be sent, a bounded number: of some kinds the newest, and others in their order."""
+
+    def __init__(self, *first: str, most: int) -> None:
+        """Send the kinds ``first`` before those in order, of which ``most`` may wait, and other kinds after them."""
+        self._first = first
+        self._most = most
+        self._in_order: deque[M] = deque()
+        self._newest: dict[str, M] = {}
+
+    def put(self, message: M) -> bool:
+        """Add a message that is sent in its order; False if too many wait: then it is dropped."""
+        if len(self._in_order) >= self._most:
+            return False
+        self._in_order.append(message)
+        return True
+
+    def put_newest(self, kind: str, message: M) -> None:
+        """Replace the message of this kind."""
+        self._newest[kind] = message
+
+    def discard(self, kind: str) -> None:
+        """Send no message of this kind."""
+        self._newest.pop(kind, None)
+
+    def pop(self) -> M | None:
+        """Remove and return the message that is sent next; None if there is none."""
+        for kind in self._first:
+            if kind in self._newest:
+                return self._newest.pop(kind)
+        if self._in_order:
+            return self._in_order.popleft()
+        return self._newest.pop(next(iter(self._newest))) if self._newest else None

@@ -20,8 +20,6 @@ from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS, STICK_AXES
 
-__all__ = ["PadQueue", "PadSource", "WebPad", "lost_reading", "pad_reading"]
-
 _RELEASED: Mapping[str, float] = MappingProxyType(dict.fromkeys(AXES, 0.0))
 _LOST_TIME = 0.05
 """A pad that was lost stays lost for at least so long, in s, so that every servo sees it: a window that gets the focus

@@ -28,8 +28,6 @@ from .messages import MalformedMessage, PictureDrawn, WatchRequest, parse
 from .sockets import PageSocket, PageSockets
 from .telemetry import rounded
 
-__all__ = ["JpegPicture", "PictureCache", "PictureCredit", "PictureSockets", "compress", "smoothed"]
-
 _HEADER = struct.Struct("<BBHIdf")  # camera, 0, 0, seq, t, age
 _SEQ_MASK = 0xFFFFFFFF
 _QUALITY = 80

@@ -19,8 +19,6 @@ from typing import Any
 from hal.errors import DriverMissing
 from hal.host.process import Channel, SharedMemory
 
-__all__ = ["LogLimit", "main"]
-
 _DESCRIPTORS = 8192
 """Far more than pages and other connections need, see :class:`~.sockets.ConnectionLimit`."""
 _MAX_RECORDS = 20

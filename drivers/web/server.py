@@ -31,11 +31,9 @@ from hal.views import ACTIONS
 
 from .messages import MalformedMessage, StopRequest, encode, parse
 from .pictures import PictureCache, PictureSockets
-from .session import AppQueue, WebPage, WebSession
+from .session import WebPage, WebSession, make_app_queue
 from .sockets import CONNECTIONS, ConnectionLimit, PageSocket, PageSockets
 from .telemetry import Telemetry
-
-__all__ = ["ConsoleServer", "keys_module", "make_app", "open_listener", "read_page_files"]
 
 _STATE_PERIOD = 0.05
 """Time between two states, in s."""
@@ -81,7 +79,7 @@ class ConsoleServer:
         self._telemetry = Telemetry(config["hosts"], hosts)
         self._cache = PictureCache(cameras, frame_rings(pictures, cameras))
         self._app_channel = AppChannel(channel, self._receive_from_app)
-        self._session = WebSession(config["rig"], self._app_channel)
+        self._session = WebSession(config["rig"], self._app_channel.queue, self._app_channel.flush)
         self._live = LiveSockets(auth, self._session)
         self._pictures = PictureSockets(auth, self._cache, self._send_watched)
         self._connections = ConnectionLimit()
@@ -116,7 +114,7 @@ class ConsoleServer:
             self._session.receive_from_app(message)
 
     def _send_watched(self, cameras: list[str]) -> None:
-        self._app_channel.queue.put_watched(cameras)
+        self._app_channel.queue.put_newest("watched", {"watched": cameras})
         self._app_channel.flush()
 
     async def _send_states(self) -> None:
@@ -144,7 +142,7 @@ class AppChannel:
 
     def __init__(self, channel: Channel, receive: Callable[[dict[str, Any]], None]) -> None:
         """``receive`` is called with every message of the app, in the loop's thread."""
-        self.queue = AppQueue()
+        self.queue = make_app_queue()
         self.ended = asyncio.Event()
         """Set when the app is gone."""
         self._channel = channel

@@ -1,8 +1,8 @@
 """The rules of the console, without any socket: which page drives, whose pad counts, what the app and pages are sent.
 
 The parts, from the inside out: :class:`PadWatch` decides whether a pad message is recent enough to count,
-:class:`DriveLease` which page is in control, :class:`AppQueue` and :class:`SendQueue` hold what waits to be sent to the
-app and to one page, and :class:`WebSession` connects them.
+:class:`DriveLease` which page is in control, :class:`SendQueue` holds what waits to be sent to one page, and
+:class:`WebSession` connects them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from hal.servo.watchdog import PAD_SILENCE
 
@@ -23,6 +23,7 @@ from .messages import (
     PAGE_SILENT,
     ControlRequest,
     MalformedMessage,
+    Outbox,
     PadMessage,
     PageLeft,
     RecordingRequest,
@@ -33,17 +34,6 @@ from .messages import (
     encode,
     parse,
 )
-
-__all__ = [
-    "AppQueue",
-    "DriveLease",
-    "LeaseChange",
-    "PadVerdict",
-    "PadWatch",
-    "SendQueue",
-    "WebPage",
-    "WebSession",
-]
 
 _MAX_REQUESTS = 16
 """Requests of pages that may wait for the app."""
@@ -182,99 +172,36 @@ class DriveLease:
 # What waits to be sent.
 
 
-class AppQueue:
-    """Messages for the app: of each kind the newest, and a few requests, however long the app does not read."""
+def make_app_queue() -> Outbox[dict[str, Any]]:
+    """Return the queue of messages for the app: of each kind the newest, and a few requests in their order.
 
-    def __init__(self) -> None:
-        self._stop: dict[str, Any] | None = None
-        self._lost: dict[str, Any] | None = None
-        self._pad: dict[str, Any] | None = None
-        self._driver: dict[str, Any] | None = None
-        self._watched: dict[str, Any] | None = None
-        self._requests: deque[dict[str, Any]] = deque()
-
-    def put_pad(self, t: float, t_alive: float, axes: tuple[float, ...], buttons: int, page: str) -> None:
-        """Replace the state of the pad; the arguments are those of a :class:`PadMessage` and its verdict."""
-        pad = {"connected": True, "t": t, "t_alive": t_alive, "axes": axes, "buttons": buttons, "from": page}
-        self._pad = {"pad": pad}
-
-    def put_pad_lost(self, t: float, why: str) -> None:
-        """Report a lost pad. The app gets this before the next state of a pad, however many of either it missed."""
-        self._pad = None
-        self._lost = {"pad": {"connected": False, "t": t, "why": why}}
-
-    def put_stop(self, page: str) -> None:
-        """Request a stop of every arm; two that wait become one."""
-        self._stop = {"stop": page}
-
-    def put_driver(self, page: str | None) -> None:
-        """Replace the name of the page in control."""
-        self._driver = {"driver": page}
-
-    def put_watched(self, cameras: list[str]) -> None:
-        """Replace the list of the cameras that pages show."""
-        self._watched = {"watched": cameras}
-
-    def put_request(self, message: dict[str, Any]) -> bool:
-        """Add another request of a page. False if too many wait; then it is dropped."""
-        if len(self._requests) >= _MAX_REQUESTS:
-            return False
-        self._requests.append(message)
-        return True
-
-    def pop(self) -> dict[str, Any] | None:
-        """Remove and return the most urgent message; None if there is none."""
-        for name in ("_stop", "_lost", "_driver", "_pad"):
-            message: dict[str, Any] | None = getattr(self, name)
-            if message is not None:
-                setattr(self, name, None)
-                return message
-        if self._requests:
-            return self._requests.popleft()
-        message, self._watched = self._watched, None
-        return message
+    A lost pad (``lost``) comes before the next state of a pad, however many of either the app missed.
+    """
+    return Outbox("stop", "lost", "driver", "pad", most=_MAX_REQUESTS)
 
 
-class SendQueue:
-    """Messages for one page, a bounded number: the newest beat first, then notes in order, then the newest of the rest.
+class SendQueue(Outbox[str]):
+    """Messages for one page: the newest ``beat`` first, then notes in order, then the newest of the rest.
 
     Only :meth:`pump` waits for the page, so a page that is slow or frozen delays no other.
     """
 
     def __init__(self, overflow: Callable[[], None]) -> None:
         """``overflow`` is called when a note is lost: the page must be disconnected."""
+        super().__init__("beat", most=_MAX_NOTES)
         self._overflow = overflow
-        self._beat: str | None = None
-        self._notes: deque[str] = deque()
-        self._newest: dict[str, str] = {}
         self._changed = asyncio.Event()
-
-    def put_beat(self, text: str) -> None:
-        """Replace the answer to a pad message."""
-        self._beat = text
-        self._changed.set()
 
     def put_note(self, text: str) -> None:
         """Add a message that must not be left out."""
-        if len(self._notes) >= _MAX_NOTES:
+        if self.put(text):
+            self._changed.set()
+        else:
             self._overflow()
-            return
-        self._notes.append(text)
-        self._changed.set()
 
-    def put_newest(self, kind: str, text: str) -> None:
-        """Replace the message of this kind."""
-        self._newest[kind] = text
+    def put_newest(self, kind: str, message: str) -> None:
+        super().put_newest(kind, message)
         self._changed.set()
-
-    def pop(self) -> str | None:
-        """Remove and return the message that is sent next; None if there is none."""
-        if self._beat is not None:
-            text, self._beat = self._beat, None
-            return text
-        if self._notes:
-            return self._notes.popleft()
-        return self._newest.pop(next(iter(self._newest))) if self._newest else None
 
     async def pump(self, send: Callable[[str], Awaitable[None]]) -> None:
         """Send every message until the connection breaks or the task is cancelled. ``send`` waits for a slow page."""
@@ -286,15 +213,6 @@ class SendQueue:
                     await send(text)
         except ConnectionError:
             pass  # the reader of the page's socket notices it too
-
-
-class AppSink(Protocol):
-    """The way to the app, as the session uses it: see :class:`~.server.AppChannel`."""
-
-    queue: AppQueue
-
-    def flush(self) -> None:
-        """Send what waits in :attr:`queue`."""
 
 
 class WebPage:
@@ -311,10 +229,18 @@ class WebPage:
 class WebSession:
     """Every open page, the one in control, and the newest view of everything that the app shows. One thread."""
 
-    def __init__(self, rig: Mapping[str, Any], app: AppSink, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        rig: Mapping[str, Any],
+        to_app: Outbox[dict[str, Any]],
+        flush: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare a session; ``flush`` sends the app what waits in ``to_app``."""
         self._rig = rig
         self._robots = frozenset(robot["name"] for robot in rig["robots"])
-        self._app = app
+        self._to_app = to_app
+        self._flush = flush
         self._clock = clock
         self._opened = 0
         self._lease = DriveLease()
@@ -386,8 +312,8 @@ class WebSession:
 
     def stop(self, page: WebPage) -> None:
         """Request a stop of every arm; every page may, in control or not."""
-        self._app.queue.put_stop(page.name)
-        self._app.flush()
+        self._to_app.put_newest("stop", {"stop": page.name})
+        self._flush()
 
     def _receive_pad(self, page: WebPage, message: PadMessage) -> None:
         watch = self._lease.watch_of(page.name)
@@ -396,20 +322,25 @@ class WebSession:
         now = self._clock()
         verdict = watch.judge(message, now)
         if verdict.lost is not None:
-            self._app.queue.put_pad_lost(now, verdict.lost)
+            self._lose_pad(now, verdict.lost)
         if verdict.dropped is not None and not now - page.complained < _COMPLAINT_PERIOD:
             page.complained = now
             self._refuse(page, _TOO_SLOW.format(verdict.dropped))
         if verdict.t_alive is not None:
-            self._app.queue.put_pad(now, verdict.t_alive, message.axes, message.buttons, page.name)
-        self._app.flush()
-        page.queue.put_beat(encode({"type": "beat", "t": watch.stamp(now)}))
+            pad = {"connected": True, "t": now, "t_alive": verdict.t_alive, "axes": message.axes}
+            self._to_app.put_newest("pad", {"pad": {**pad, "buttons": message.buttons, "from": page.name}})
+        self._flush()
+        page.queue.put_newest("beat", encode({"type": "beat", "t": watch.stamp(now)}))
 
     def _disconnect_pad(self, page: WebPage, why: str) -> None:
         watch = self._lease.watch_of(page.name)
         if watch is not None and watch.disconnect(why) is not None:
-            self._app.queue.put_pad_lost(self._clock(), why)
-            self._app.flush()
+            self._lose_pad(self._clock(), why)
+
+    def _lose_pad(self, t: float, why: str) -> None:
+        self._to_app.discard("pad")
+        self._to_app.put_newest("lost", {"pad": {"connected": False, "t": t, "why": why}})
+        self._flush()
 
     def _take_or_release(self, page: WebPage, take: bool) -> None:
         now = self._clock()
@@ -442,10 +373,10 @@ class WebSession:
     def _request(self, page: WebPage, message: dict[str, Any], what: str) -> None:
         if self._lease.driver != page.name:
             self._refuse(page, f"only the page in control may {what}")
-        elif not self._app.queue.put_request(message):
+        elif not self._to_app.put(message):
             self._refuse(page, "the program does not answer")
         else:
-            self._app.flush()
+            self._flush()
 
     # Changes of control.
 
@@ -453,9 +384,9 @@ class WebSession:
         if change is None:
             return
         if change.before is not None:
-            self._app.queue.put_pad_lost(change.t, change.why)
-        self._app.queue.put_driver(change.driver)
-        self._app.flush()
+            self._lose_pad(change.t, change.why)
+        self._to_app.put_newest("driver", {"driver": change.driver})
+        self._flush()
         for page in self.pages.values():
             self._send_lease(page, change.t)
 
@@ -522,5 +453,4 @@ class WebSession:
         watch = self._lease.watch
         why = watch.check_silence(now) if watch is not None else None
         if why is not None:
-            self._app.queue.put_pad_lost(now, why)
-            self._app.flush()
+            self._lose_pad(now, why)

@@ -15,8 +15,6 @@ from hal.auth import PROTOCOL, Authenticator
 
 from .messages import MAX_BYTES
 
-__all__ = ["CONNECTIONS", "ConnectionLimit", "PageSocket", "PageSockets", "RateLimit"]
-
 CloseReason = tuple[int, bytes]
 """Why a socket is closed: a code of RFC 6455's private range, and a text."""
 Handle = Callable[[str | None], None]

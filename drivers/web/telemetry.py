@@ -11,8 +11,6 @@ from hal.errors import Fault
 from hal.host.records import GripperMail, GroupMemory, RobotMail
 from hal.types import RobotState, RobotStatus, Trip
 
-__all__ = ["Telemetry", "rounded"]
-
 _MAX_AGE = 0.1
 """A state older than this is not shown, in s; the same limit as that of ``robot.state()``."""
 _GRIPPER_MAX_AGE = 0.5

@@ -23,21 +23,10 @@ from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
 from ..specs import CameraSpec, RobotSpec
 from .data_files import user_path
-from .files import Problems, leave_holes, read_yaml, suggest, validate
-from .models import CameraModel, FileSource, GripperModel, RobotModel, find_model
+from .files import Problems, find_file, leave_holes, read_yaml, suggest, validate
+from .models import CameraModel, FileSource, GripperModel, RobotModel
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
-
-__all__ = [
-    "Context",
-    "check_camera_spec",
-    "check_robot_spec",
-    "find_mesh",
-    "is_emulated",
-    "load_arm",
-    "load_urdf",
-    "merge_options",
-]
 
 Model = TypeVar("Model", RobotModel, CameraModel)
 Config = RobotConfig | GripperConfig | CameraConfig
@@ -91,6 +80,17 @@ class Context:
         """Add a problem in the rig's file; the arguments are those of :meth:`.files.Problems.add`."""
         self.problems.add(self.source, key, message, code)
 
+    def check_link(self, file: str, key: str, robot: str, link: str) -> None:
+        """Add a problem if there is no such robot, or it has no such link; ``key`` is that of both."""
+        if robot not in self.rig.robots:
+            message = f"this rig has no robot {robot!r}{suggest(robot, self.rig.robots)}"
+            self.problems.add(file, f"{key}.robot", message, "unknown_device")
+        urdf = self.urdfs.get(robot)  # None if the robot itself has problems
+        others = self.links.get(robot, {})
+        if urdf is not None and link not in urdf.links and link not in others:
+            text = f"robot {robot!r} has no link {link!r}{suggest(link, (*urdf.links, *others))}"
+            self.problems.add(file, f"{key}.link", text, "unknown_link")
+
     def is_simulated(self, device: Device, parent: Device | None = None) -> bool:
         """Return whether a device is simulated; ``parent`` is the arm of a gripper."""
         if self.sim is True or self.driver is not None:
@@ -105,7 +105,8 @@ class Context:
     ) -> tuple[Model, Path]:
         """Return a device's model and its file; without one, a model of holes only, and the problem is added."""
         with suppress(Unknown):
-            found = find_model(config.model, folder, parts, self.base)
+            name = (folder, *parts)[-1].removesuffix("s")
+            found = find_file(config.model, f"{name} model", self.base, folder, *parts)
             if isinstance(found, Path):
                 data = read_yaml(found, self.problems)
                 if data is not None and isinstance(config, RobotConfig):

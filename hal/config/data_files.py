@@ -9,8 +9,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-__all__ = ["FOLDERS", "data_folder", "find_data", "is_path", "list_data", "user_path"]
-
 FOLDERS = ("robots", "sensors", "config")
 
 

@@ -27,24 +27,9 @@ import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import ConfigError, Problem
+from ..specs import CameraSpec, GripperSpec, RobotSpec
 from .data_files import data_folder, is_path, list_data, user_path
-from .schema import ValueProblem, describe, find_kind, find_record, list_keys
-
-__all__ = [
-    "PlacedErrors",
-    "Problems",
-    "apply_overrides",
-    "check_size",
-    "find_closest",
-    "load_record",
-    "suggest",
-    "parse_yaml",
-    "copy_plain",
-    "read_yaml",
-    "validate",
-    "leave_holes",
-    "describe_yaml_error",
-]
+from .schema import Strict, ValueProblem, describe, find_kind, find_record, list_keys
 
 
 class Problems:
@@ -316,6 +301,29 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
                 problems.written[str(file), _join_key(prefix, right)] = str(one["loc"][-1])
 
 
+class DeviceSettings(Strict):
+    """Base of the settings that a driver takes under ``real:`` of a device."""
+
+    @classmethod
+    def of(cls: type[M], spec: RobotSpec | GripperSpec | CameraSpec) -> M:
+        """Return the settings in a device's record. Raises ConfigError, which lists every problem."""
+        problems, section = Problems(), "cameras" if isinstance(spec, CameraSpec) else "robots"
+        settings = validate(cls, spec.options, f"{section}.{spec.name}.real", problems)
+        problems.raise_any()
+        return settings
+
+    @classmethod
+    def check(cls: type[M], spec: RobotSpec | GripperSpec | CameraSpec) -> tuple[M | None, list[tuple[str, str, str]]]:
+        """Return the settings in a device's record, None if they have problems, and the problems.
+
+        A problem is a key in the device's entry of the rig file, a message and a code.
+        """
+        problems = Problems()
+        settings = validate(cls, spec.options, "", problems, "real")
+        found = [(problem.key, problem.message, problem.code) for problem in problems.found]
+        return (None if found else settings), found
+
+
 def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folder: str, kind: str) -> M:
     """Return the record of a built-in file, a file of the user, or data.
 
@@ -332,22 +340,36 @@ def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folde
     if isinstance(given, model):
         return given
     problems = Problems()
-    if isinstance(given, Mapping):
-        result = validate(model, given, "<dict>", problems)
-    else:
-        name = str(given)
-        if isinstance(given, Path) or is_path(name):
-            path = user_path(name, Path.cwd())
-        elif name in (there := list_data("config", folder)):
-            path = data_folder("config") / folder / f"{name}.yaml"
-        else:
-            message = f"there is no {kind.replace('_', ' ')} {name!r}{suggest(name, there)}, or a path to your own"
-            raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), message, f"unknown_{kind}")])
-        data = read_yaml(path, problems)
+    file: Path | str = "<dict>"
+    data: Any = given
+    if not isinstance(given, Mapping):
+        file = find_file(given, kind.replace("_", " "), Path.cwd(), "config", folder)
+        if isinstance(file, str):
+            raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), file, f"unknown_{kind}")])
+        data = read_yaml(file, problems)
         problems.raise_any()
-        result = validate(model, data, path, problems)
+    result = validate(model, data, file, problems)
     problems.raise_any()
     return result
+
+
+def find_file(given: str | Path, kind: str, base: Path, folder: str, *parts: str) -> Path | str:
+    """Return the path of a YAML file, or a message if there is none.
+
+    Args:
+        given: A path, or the name of a built-in file.
+        kind: What the file is, for the message.
+        base: Folder that a path is relative to.
+        folder: Data folder of the built-in files.
+        parts: Folders below it.
+    """
+    name = str(given)
+    if isinstance(given, Path) or is_path(name):
+        return user_path(given, base)
+    there = list_data(folder, *parts)
+    if name not in there:
+        return f"there is no {kind} {name!r}{suggest(name, there)}, or a path to your own"
+    return data_folder(folder).joinpath(*parts, f"{name}.yaml")
 
 
 def leave_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:

@@ -15,12 +15,9 @@ from pydantic import PrivateAttr
 from .. import registry
 from ..specs import Plan
 from .context import Context
-from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, apply_overrides, read_yaml, suggest, validate
+from .files import Problems, apply_overrides, find_file, read_yaml, suggest, validate
 from .resolve import resolve
 from .rigfile import RigFile
-
-__all__ = ["RigConfig", "load"]
 
 CLOCKS = ("real_time", "lock_step")
 
@@ -98,14 +95,8 @@ def _choose_stand_in(driver: str | None, problems: Problems) -> str | None:
 def _read(config: str | Path | Mapping[str, Any], problems: Problems) -> tuple[dict[str, Any] | None, str, Path]:
     if isinstance(config, Mapping):
         return dict(config), "<dict>", Path.cwd()
-    name = str(config)
-    if isinstance(config, Path) or is_path(name):
-        path = user_path(config, Path.cwd())
-        return read_yaml(path, problems), str(path), path.parent
-    rigs = list_data("config")
-    if name not in rigs:
-        message = f"there is no rig {name!r}{suggest(name, rigs)}, or a path to your own"
-        problems.add("<arguments>", "config", message, "unknown_rig")
-        return None, name, Path.cwd()
-    path = data_folder("config") / f"{name}.yaml"
+    path = find_file(config, "rig", Path.cwd(), "config")
+    if isinstance(path, str):
+        problems.add("<arguments>", "config", path, "unknown_rig")
+        return None, str(config), Path.cwd()
     return read_yaml(path, problems), str(path), path.parent

@@ -16,8 +16,6 @@ from ..types import AXES, BUTTONS, PadState
 from .files import load_record, suggest
 from .schema import Flag, Quantity, Strict, ValueProblem
 
-__all__ = ["AxisMapping", "DirectionsMapping", "GripperMapping", "TeleopMapping", "TurnsMapping", "load_mapping"]
-
 
 class AxisMapping(Strict):
     """One direction of motion: an axis, or a pair of buttons, and the greatest speed."""

@@ -6,14 +6,13 @@ A model of your own is a file with the same keys, which a rig names by its path.
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..types import STREAMS
-from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, read_yaml, suggest
+from .data_files import data_folder, list_data
+from .files import Problems, read_yaml
 from .schema import (
     Accelerations,
     CameraRate,
@@ -27,7 +26,6 @@ from .schema import (
     Name,
     Offset,
     Pixels,
-    PoseConfig,
     Quantity,
     QuaternionConfig,
     RateHz,
@@ -41,28 +39,6 @@ from .schema import (
     Velocities,
     ViewAngle,
 )
-
-__all__ = [
-    "CameraModel",
-    "Capture",
-    "CompleteStream",
-    "Depth",
-    "DepthSensor",
-    "Drivers",
-    "FieldOfView",
-    "FileSource",
-    "GripperModel",
-    "LimitsModel",
-    "Mode",
-    "PoseConfig",
-    "RobotModel",
-    "SensorStream",
-    "StreamModel",
-    "ToolModel",
-    "expand_names",
-    "find_model",
-    "load_pad_models",
-]
 
 
 class Drivers(Strict):
@@ -97,6 +73,17 @@ class LimitsModel(Strict):
     acceleration: Accelerations | None = None
     jerk: Jerks | None = None
     torque: Torques | None = None
+
+
+UNITS = {
+    "lower": "rad",
+    "upper": "rad",
+    "velocity": "rad/s",
+    "acceleration": "rad/s2",
+    "jerk": "rad/s3",
+    "torque": "Nm",
+}
+"""Key of :class:`LimitsModel` -> its unit."""
 
 
 class TcpModel(Strict):
@@ -427,24 +414,6 @@ class CompleteStream(NamedTuple):
 
 
 # Files
-
-
-def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Path | str:
-    """Return the path of a model, or a message if there is none.
-
-    Args:
-        name: A path, or the name of a built-in model.
-        folder: Data folder of the built-in models, and ``parts`` the folders below it.
-        parts: See ``folder``.
-        base: Folder that a path is relative to.
-    """
-    if is_path(name):
-        return user_path(name, base)
-    there = list_data(folder, *parts)
-    if name not in there:
-        kind = (folder, *parts)[-1].removesuffix("s")
-        return f"there is no {kind} model {name!r}{suggest(name, there)}, or a path to your own"
-    return data_folder(folder).joinpath(*parts, f"{name}.yaml")
 
 
 def load_pad_models(problems: Problems) -> dict[str, dict[str, Any]]:

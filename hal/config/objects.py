@@ -14,8 +14,7 @@ from pydantic import AfterValidator, model_validator
 from ..kinematics.urdf import UrdfModel
 from ..specs import BodySpec, RangesSpec, Vector3
 from .context import Context, find_mesh, load_urdf
-from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, read_yaml, suggest, validate
+from .files import Problems, find_file, read_yaml, suggest, validate
 from .models import FileSource
 from .schema import (
     Factor,
@@ -35,8 +34,6 @@ from .schema import (
     ValueProblem,
     describe,
 )
-
-__all__ = ["CarriedBy", "ObjectConfig", "RandomPose", "load_objects"]
 
 _ENDS = "the least and the greatest"
 
@@ -174,7 +171,6 @@ def load_objects(context: Context) -> tuple[BodySpec, ...]:
     bodies = []
     problems, source = context.problems, context.source
     taken = {name: f"robots.{name} in {source}" for name in getattr(context.rig, "robots", ())}
-    robots = tuple(taken)
     for k, entry in enumerate(context.rig.objects):
         key = f"objects.{k}"
         loaded = _load(entry, source, context.base, key, problems)
@@ -198,7 +194,7 @@ def load_objects(context: Context) -> tuple[BodySpec, ...]:
                 mesh = find_mesh(config.mesh, folder, file, f"{prefix}mesh", problems)
         with suppress(Unknown):
             if config.attached is not None:
-                _check_attached(context, config.attached, robots, file, f"{prefix}attached")
+                context.check_link(file, f"{prefix}attached", config.attached.robot, config.attached.link)
         if not problems.found:
             bodies.append(_make_body(config, urdf, mesh, context.links))
     return tuple(bodies)
@@ -237,31 +233,16 @@ def _find_file(entry: object, source: str, base: Path, key: str, problems: Probl
     """Return the file of an object; None, with the problem added, if there is none."""
     if not isinstance(entry, str):
         message, code = f"must be a file, a name or keys and values, not {describe(entry)}", "wrong_type"
-    elif is_path(entry):
-        path = user_path(entry, base)
-        if os.path.isfile(path):  # unlike Path.is_file, it has no error for names that are too long
-            return path
+    elif isinstance(path := find_file(entry, "object", base, "config", "objects"), str):
+        message, code = path, "unknown_object"
+    elif os.path.isfile(path):  # unlike Path.is_file, it has no error for names that are too long
+        return path
+    else:
         there = [f"{path.parent.name}/{found.name}" for found in path.parent.glob("*.yaml")]
         hint = suggest(f"{path.parent.name}/{path.name}", there)
         message, code = f"there is no file {path}{hint}", "missing_file"
-    else:
-        there = list(list_data("config", "objects"))
-        if entry in there:
-            return data_folder("config") / "objects" / f"{entry}.yaml"
-        message = f"there is no object {entry!r}{suggest(entry, there)}, or a path to your own"
-        code = "unknown_object"
     problems.add(source, key, message, code)
     return None
-
-
-def _check_attached(context: Context, carried: CarriedBy, robots: tuple[str, ...], file: str, key: str) -> None:
-    if carried.robot not in robots:
-        text = f"this rig has no robot {carried.robot!r}{suggest(carried.robot, robots)}"
-        context.problems.add(file, f"{key}.robot", text, "unknown_device")
-    urdf, others = context.urdfs.get(carried.robot), context.links.get(carried.robot, {})
-    if urdf is not None and carried.link not in urdf.links and carried.link not in others:
-        text = f"robot {carried.robot!r} has no link {carried.link!r}{suggest(carried.link, (*urdf.links, *others))}"
-        context.problems.add(file, f"{key}.link", text, "unknown_link")
 
 
 def _make_body(

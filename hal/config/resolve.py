@@ -22,15 +22,13 @@ from ..pads.model import pad_model
 from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RobotSpec, WorldSpec
 from .context import Context
 from .data_files import user_path
-from .files import read_yaml, suggest
-from .models import find_model, load_pad_models
+from .files import find_file, read_yaml, suggest
+from .models import load_pad_models
 from .objects import load_objects
 from .resolve_cameras import resolve_camera
 from .resolve_robots import resolve_robot
 from .rigfile import Device, PadConfig
 from .schema import Unknown
-
-__all__ = ["resolve", "resolve_pad"]
 
 CHOSEN_LATER = "auto"
 """Stands for a pad that is chosen when the rig opens, in place of the name of a driver."""
@@ -194,7 +192,7 @@ def _pad_driver(context: Context, key: str, config: PadConfig) -> str | None:
 def _pad_model(context: Context, key: str, config: PadConfig) -> dict[str, Any] | None:
     if config.model == CHOSEN_LATER:
         return None
-    found = find_model(config.model, "sensors", ("gamepads",), context.base)
+    found = find_file(config.model, "gamepad model", context.base, "sensors", "gamepads")
     if isinstance(found, str):
         context.report(f"{key}.model", f"{found}, or auto", "unknown_model")
         return None

@@ -18,12 +18,6 @@ from .models import CameraModel, Capture
 from .rigfile import CameraConfig, Output, Stream, StreamConfig, make_view
 from .schema import Unknown
 
-__all__ = [
-    "Streams",
-    "resolve_camera",
-    "resolve_streams",
-]
-
 _ONE_SENSOR = ("depth", *(name for name, kind in STREAMS.items() if kind.like))
 """Streams that a depth camera computes from the same images: of one size, at one rate."""
 
@@ -105,17 +99,8 @@ def _check_place(context: Context, key: str, config: CameraConfig) -> None:
 
 
 def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
-    if config.attached is None:
-        return
-    robot, robots = config.attached.robot, context.rig.robots
-    if robot not in robots:
-        message = f"this rig has no robot {robot!r}{suggest(robot, robots)}"
-        context.report(f"{key}.attached.robot", message, "unknown_device")
-    urdf = context.urdfs.get(robot)  # None if the robot itself has problems
-    link, aliases = config.attached.link, context.links.get(robot, {})
-    if urdf is not None and link not in urdf.links and link not in aliases:
-        text = f"robot {robot!r} has no link {link!r}{suggest(link, (*urdf.links, *aliases))}"
-        context.report(f"{key}.attached.link", text, "unknown_link")
+    if config.attached is not None:
+        context.check_link(context.source, f"{key}.attached", config.attached.robot, config.attached.link)
 
 
 def _check_adjustable(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:

@@ -27,20 +27,10 @@ from ..specs import (
 )
 from .context import Context, check_robot_spec, is_emulated, load_arm, merge_options
 from .files import Problems, suggest
-from .models import LimitsModel, RobotModel
+from .models import UNITS, LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig, WorkspaceConfig
 from .schema import Quantity, Unknown
 
-__all__ = ["resolve_limits", "resolve_robot", "spread"]
-
-UNITS = {
-    "lower": "rad",
-    "upper": "rad",
-    "velocity": "rad/s",
-    "acceleration": "rad/s2",
-    "jerk": "rad/s3",
-    "torque": "Nm",
-}
 MOST_REAL = {
     "velocity": Quantity("rad/s", 0.0, 15.0, above=True),
     "acceleration": Quantity("rad/s2", 0.0, 100.0, above=True),

@@ -56,25 +56,6 @@ from .schema import (
     describe,
 )
 
-__all__ = [
-    "Attached",
-    "BoxConfig",
-    "CameraConfig",
-    "CollisionsConfig",
-    "GripperConfig",
-    "LimitsConfig",
-    "LookAt",
-    "PadConfig",
-    "PayloadConfig",
-    "RigFile",
-    "RobotConfig",
-    "SimulationConfig",
-    "WorkspaceConfig",
-    "make_optical_pose",
-    "rig_schema",
-    "make_view",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -19,51 +19,6 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-__all__ = [
-    "Accelerations",
-    "CameraRate",
-    "Coordinate",
-    "Degrees",
-    "Direction",
-    "Distance",
-    "Factor",
-    "FingerPosition",
-    "Flag",
-    "Force",
-    "Gravity",
-    "Jerks",
-    "JointLimits",
-    "JointPositions",
-    "Mass",
-    "Name",
-    "Offset",
-    "Pixels",
-    "PoseConfig",
-    "Position",
-    "Quantity",
-    "QuaternionConfig",
-    "RateHz",
-    "Rgba",
-    "Seconds",
-    "Several",
-    "Share",
-    "Size",
-    "Sizes",
-    "Speed",
-    "Strict",
-    "TcpSpeed",
-    "Torques",
-    "Unknown",
-    "ValueProblem",
-    "Velocities",
-    "ViewAngle",
-    "describe",
-    "is_number",
-    "list_keys",
-    "find_kind",
-    "find_record",
-]
-
 
 class Unknown(AttributeError):
     """A key was read whose value is wrong or missing, which is already a problem: skip what needs it."""

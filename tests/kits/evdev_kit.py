@@ -109,7 +109,7 @@ class FakeNode:
 
 
 class FakeInput:
-    """An :class:`~hal.drivers.evdev.finder.InputSystem` in memory."""
+    """An :class:`~hal.drivers.evdev.finder.LinuxInput` in memory."""
 
     def __init__(self) -> None:
         self.plugged: dict[str, tuple[NodeInfo, FakeNode]] = {}

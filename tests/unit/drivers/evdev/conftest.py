@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from evdev_kit import FakeInput, MakePad, pads_on
 
-collect_ignore_glob = [] if sys.platform == "linux" else ["test_*.py"]  # inotify and evdev are Linux only
+collect_ignore_glob = [] if sys.platform == "linux" else ["test_*.py"]  # evdev is Linux only
 
 
 @pytest.fixture

@@ -75,13 +75,6 @@ def test_the_formula_for_the_speed() -> None:
     assert expected == pytest.approx(0.467, abs=1e-3)
 
 
-def test_the_suggested_rectangle_has_corners_a_little_beyond_the_formula() -> None:
-    box = FR3.rectangle
-    lowest, highest = FR3.velocity_range(box.lower)[0], FR3.velocity_range(box.upper)[1]
-    shares = [box.velocity[k] / min(highest[k], -lowest[k]) for k in range(7)]
-    assert 1.0 < max(shares) < 1.045
-
-
 def moving(dq: float = 0.0, ddq: float = 0.0, joint: int = 0, q: tuple[float, ...] = HOME) -> MotionSample:
     """One joint moves, the others stand."""
     return MotionSample(

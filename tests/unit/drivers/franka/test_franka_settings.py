@@ -206,7 +206,8 @@ def test_an_fr3_may_not_be_fast_where_its_range_ends() -> None:
 
 
 def test_franka_s_own_rectangular_speeds_are_a_little_too_fast() -> None:
-    ((key, text, code),) = check_arm(limited(velocity=FR3.rectangle.velocity))
+    rectangular = (2.0, 1.0, 1.5, 1.25, 3.0, 1.5, 3.0)  # control-parameters-joint-fr3-rectangular.csv
+    ((key, text, code),) = check_arm(limited(velocity=rectangular))
     assert (key, code) == ("limits", "out_of_range")
     assert all(f"fr3_joint{k}" in text for k in range(1, 8))
 

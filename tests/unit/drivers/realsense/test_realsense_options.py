@@ -39,7 +39,7 @@ def camera(**options: Any) -> CameraSpec:
 )
 def test_valid_options(options: dict[str, Any]) -> None:
     assert list(problems(camera(**options))) == []
-    RealSenseSettings.from_spec(camera(**options))
+    RealSenseSettings.of(camera(**options))
 
 
 def test_options_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,7 +48,7 @@ def test_options_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert [(key, code) for key, _, code in problems(camera(**options))] == [("real.play", "missing_file")]
     (tmp_path / "today.db3").touch()
     assert list(problems(camera(**options))) == []
-    assert RealSenseSettings.from_spec(camera(**options)).play == str(tmp_path / "today.db3")
+    assert RealSenseSettings.of(camera(**options)).play == str(tmp_path / "today.db3")
 
 
 def test_the_folder_of_a_recording_must_exist(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_wrong_options(options: dict[str, Any], key: str) -> None:
     assert place == key
     assert code != "invalid"
     with pytest.raises(ConfigError) as caught:
-        RealSenseSettings.from_spec(camera(**options))
+        RealSenseSettings.of(camera(**options))
     assert {problem.file for problem in caught.value.problems} == {"cameras.wrist.real"}
 
 

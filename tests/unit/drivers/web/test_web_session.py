@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hal.drivers.web.messages import MESSAGES_LATE, PAGE_SILENT, MalformedMessage
-from hal.drivers.web.session import AppQueue, SendQueue, WebPage, WebSession
+from hal.drivers.web.session import SendQueue, WebPage, WebSession, make_app_queue
 
 RIG: dict[str, Any] = {"drivable": True, "driven_by": None, "demo": True, "cameras": []}
 RIG |= {"robots": [{"name": "panda"}, {"name": "ur5"}]}
@@ -18,7 +18,7 @@ class App:
     """Reads at once, while ``reads`` is True."""
 
     def __init__(self) -> None:
-        self.queue = AppQueue()
+        self.queue = make_app_queue()
         self.told: list[dict[str, Any]] = []
         self.reads = True
 
@@ -43,7 +43,7 @@ class Room:
     def __init__(self, **rig: Any) -> None:
         self.now = 100.0
         self.app = App()
-        self.session = WebSession({**RIG, **rig}, self.app, lambda: self.now)
+        self.session = WebSession({**RIG, **rig}, self.app.queue, self.app.flush, lambda: self.now)
         self.cut: list[int] = []
 
     def page(self) -> WebPage:
@@ -342,12 +342,14 @@ def test_an_app_that_reads_again_gets_the_loss_and_the_newest_pad(room: Room) ->
     assert pad["pad"]["axes"][0] == 199 / 200.0
 
 
-def test_a_loss_replaces_the_pad_before_it() -> None:
-    queue = AppQueue()
-    queue.put_pad(1.0, 1.0, (1.0,), 0, "page 1")
-    queue.put_pad_lost(2.0, "it was hidden")
-    assert queue.pop() == {"pad": {"connected": False, "t": 2.0, "why": "it was hidden"}}
-    assert queue.pop() is None
+def test_a_loss_replaces_the_pad_before_it(room: Room) -> None:
+    driver = room.driver()
+    room.app.reads = False
+    room.pad(driver, room.now)
+    room.say(driver, type="away", why="hidden")
+    room.app.reads = True
+    room.app.flush()
+    assert room.app.pads() == [("the page was hidden",)]
 
 
 def test_requests_are_refused_while_the_app_does_not_read(room: Room) -> None:
@@ -373,7 +375,7 @@ def test_beats_first_then_notes_in_order_then_the_newest_of_the_rest() -> None:
         queue.put_newest("state", f"state {k}")
         queue.put_newest("recording", f"recording {k}")
         queue.put_note(f"note {k}")
-        queue.put_beat(f"beat {k}")
+        queue.put_newest("beat", f"beat {k}")
     assert list(iter(queue.pop, None)) == ["beat 2", "note 0", "note 1", "note 2", "state 2", "recording 2"]
 
 
