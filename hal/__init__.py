@@ -21,6 +21,10 @@ if os.path.isfile(os.path.join(__path__[0], "drivers")):  # a link in a checkout
         "git config core.symlinks true && git restore hal src (on Windows in developer mode or as administrator)"
     )
 
+__path__ = [os.path.realpath(folder) for folder in __path__]
+"""Where its modules are, without links, so that debuggers stop at breakpoints set in a checkout; in its ``drivers`` and
+``apps``, too."""
+
 if TYPE_CHECKING:
     from . import gym as gym
     from .camera import Camera

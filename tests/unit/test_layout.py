@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -109,6 +110,12 @@ def circles() -> list[list[str]]:
             visit(module, backwards, part)
             found.append(sorted(part))
     return [part for part in found if len(part) > 1]
+
+
+def test_modules_run_from_the_files_that_a_user_opens() -> None:
+    """Not through the links of a checkout: debuggers compare paths, and would stop at no breakpoint."""
+    for name in ("hal.rig", "hal.drivers.mock.robot", "hal.apps.main"):
+        assert import_module(name).__file__ == str(sources()[name].resolve())
 
 
 def test_import_circles_are_few_and_small() -> None:
