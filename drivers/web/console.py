@@ -114,7 +114,7 @@ class WebConsole(Console):
     def tunnel(self) -> str:
         return ssh_tunnel(self._address, self._port) if is_loopback(self._address) else ""
 
-    # The pad's side, see PadSource.
+    # The pad's side, see WebPad.
 
     @property
     def driver(self) -> str | None:
