@@ -194,9 +194,9 @@ class TeleopDisplay:
     def _print_event(self, event: SessionEvent) -> None:
         self.line.event(event.text)
         if event.kind == "stopped":
-            self.report.add_trip(event.reason)
+            self.report.add_event(self.report.trips, reason=event.reason)
         elif event.kind == "fault":
-            self.report.add_fault(event.reason)
+            self.report.add_event(self.report.faults, cause=event.reason)
         elif event.kind == "robot_changed":
             self.report.set_robots([arm.robot for arm in self.session.arms])
         elif event.kind == "pad_changed":
@@ -270,13 +270,9 @@ class RunReport:
             self._travel += float(delta @ delta) ** 0.5
         self._positions[robot.name] = position
 
-    def add_trip(self, reason: str) -> None:
-        """Add a trip."""
-        self.trips.append({"t_s": round(self._rig.clock.now() - self.start, 3), "reason": reason})
-
-    def add_fault(self, cause: str) -> None:
-        """Add a fault."""
-        self.faults.append({"t_s": round(self._rig.clock.now() - self.start, 3), "cause": cause})
+    def add_event(self, events: list[dict[str, Any]], **what: str) -> None:
+        """Add an event of this moment to :attr:`trips` or :attr:`faults`."""
+        events.append({"t_s": round(self._rig.clock.now() - self.start, 3), **what})
 
     def collect(self, clean_exit: bool) -> dict[str, Any]:
         """Return everything so far. Call it while the rig is open.

@@ -232,7 +232,7 @@ class _Screen:
         self._live = stream.isatty()
         self._next = 0.0
         self._drawn = 0
-        self._printed: dict[str, _PadValues] = {}
+        self._printed: dict[str, tuple[PadState, tuple[str, ...]]] = {}
 
     def print(self, text: str) -> None:
         """Print lines above the block."""
@@ -258,10 +258,10 @@ class _Screen:
         self._drawn = 0
 
     def _print_changes(self, name: str, pad: Gamepad) -> None:
-        now, before = _PadValues(pad.state(), pad.waiting_for), self._printed.get(name)
-        if before is None or now.differs(before):
+        now, before = (pad.state(), pad.waiting_for), self._printed.get(name)
+        if before is None or now[1] != before[1] or _differ(now[0], before[0]):
             self._printed[name] = now
-            self._write(f"{name}: {now}\n")
+            self._write(f"{name}: {_describe_values(*now)}\n")
 
     def _clear(self) -> None:
         if self._drawn:
@@ -273,37 +273,29 @@ class _Screen:
         self._stream.flush()
 
 
-class _PadValues:
-    """The values of a pad as shown."""
+def _differ(now: PadState, before: PadState) -> bool:
+    """Whether the difference of two states deserves another line."""
+    if (now.buttons, now.connected) != (before.buttons, before.connected):
+        return True
+    pairs = [(value, before.axes.get(name, 0.0)) for name, value in now.axes.items()]
+    return any(abs(new - old) >= _STEP or (new == 0.0) != (old == 0.0) for new, old in pairs)
 
-    def __init__(self, state: PadState, waiting_for: tuple[str, ...]) -> None:
-        self.axes = dict(state.axes)
-        self.buttons = state.buttons
-        self.connected = state.connected
-        self.waiting_for = waiting_for
 
-    def differs(self, other: _PadValues) -> bool:
-        """Whether the difference deserves another line."""
-        if (self.buttons, self.connected, self.waiting_for) != (other.buttons, other.connected, other.waiting_for):
-            return True
-        moved = (abs(value - other.axes.get(name, 0.0)) for name, value in self.axes.items())
-        ended = any((value == 0.0) != (other.axes.get(name, 0.0) == 0.0) for name, value in self.axes.items())
-        return ended or max(moved, default=0.0) >= _STEP
-
-    def __str__(self) -> str:
-        if not self.connected:
-            return "not plugged in"
-        parts = [f"{name} {value:+.2f}" for name, value in self.axes.items() if value]
-        if self.buttons:
-            parts.append(f"[{' '.join(sorted(self.buttons))}]")
-        if self.waiting_for:
-            parts.append(f"release, or move once: {', '.join(self.waiting_for)}")
-        return "  ".join(parts) or "at rest"
+def _describe_values(state: PadState, waiting_for: Sequence[str]) -> str:
+    """Return the values of a pad in one line."""
+    if not state.connected:
+        return "not plugged in"
+    parts = [f"{name} {value:+.2f}" for name, value in state.axes.items() if value]
+    if state.buttons:
+        parts.append(f"[{' '.join(sorted(state.buttons))}]")
+    if waiting_for:
+        parts.append(f"release, or move once: {', '.join(waiting_for)}")
+    return "  ".join(parts) or "at rest"
 
 
 def _block(name: str, pad: Gamepad) -> list[str]:
     """Return the values of one pad as lines of the block."""
-    shown = _PadValues(pad.state(), pad.waiting_for)
+    shown = pad.state()
     if not shown.connected:
         return [f"{name}: not plugged in"]
     lines = [f"{name}:"]
@@ -311,8 +303,8 @@ def _block(name: str, pad: Gamepad) -> list[str]:
     bars = [f"{axis:8s} {value:+5.2f} {_bar(value)}" for axis, value in reported]
     lines += ["  " + "   ".join(bars[at : at + 2]) for at in range(0, len(bars), 2)]
     lines.append(f"  pressed  {' '.join(sorted(shown.buttons)) or '-'}")
-    if shown.waiting_for:
-        lines.append(f"  release, or move once: {', '.join(shown.waiting_for)}")
+    if pad.waiting_for:
+        lines.append(f"  release, or move once: {', '.join(pad.waiting_for)}")
     return lines
 
 

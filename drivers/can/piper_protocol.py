@@ -503,10 +503,6 @@ def _pose(frame_id: int, data: bytes) -> PoseNumbers:
     return PoseNumbers(first, (values[0] / scales[0], values[1] / scales[1]))
 
 
-def _joint_angles(frame_id: int, data: bytes) -> JointAngles:
-    return JointAngles(2 * (frame_id - _ANGLES), _radians(data))
-
-
 _FEEDBACK: dict[int, Callable[[int, bytes], PiperFeedback | None]] = {
     _STATUS: lambda _, data: PiperStatus(*data),
     _GRIPPER_STATUS: _gripper_status,
@@ -516,7 +512,9 @@ _FEEDBACK: dict[int, Callable[[int, bytes], PiperFeedback | None]] = {
     _STROKE: lambda _, data: GripperStroke(data[1], data[0], data[2]),
     FIRMWARE: lambda _, data: None if (FIRMWARE, data) == FirmwareQuery().frame() else FirmwarePiece(data),
     **dict.fromkeys(range(_POSE, _POSE + 3), _pose),
-    **dict.fromkeys(range(_ANGLES, _ANGLES + 3), _joint_angles),
+    **dict.fromkeys(
+        range(_ANGLES, _ANGLES + 3), lambda frame_id, data: JointAngles(2 * (frame_id - _ANGLES), _radians(data))
+    ),
     **dict.fromkeys(range(_MOTION, _MOTION + JOINTS), _motion),
     **dict.fromkeys(range(_MOTOR_STATUS, _MOTOR_STATUS + JOINTS), _motor_status),
 }

@@ -103,7 +103,9 @@ class EvdevPad(GamepadDriver):
             return self._last
         try:
             self._link.poll(now, timeout)
-            self._play_rumble(self._link)
+            wanted, self._rumble = self._rumble, None
+            if wanted is not None:
+                self._link.rumble(*wanted)
         except OSError:
             return self._handle_loss(now)
         link = self._link
@@ -190,18 +192,14 @@ class EvdevPad(GamepadDriver):
         elif self.spec.model is not None:
             model, rule = self._models[0], None
         else:
-            model, rule = self._guessed(info, node), None
+            model, rule = guess_model(info.identity, node.axes, node.keys, node.rels), None
+            self.notes = (*self.notes, guess_warning(model))
         try:
             self._link = PadLink(info, node, model, rule)
         except OSError:  # unplugged again already
             node.close()
             return
         self.flat, self.absolute = self._link.mapper.flat, self._link.mapper.model.absolute
-
-    def _guessed(self, info: NodeInfo, node: EvdevNode) -> PadModel:
-        model = guess_model(info.identity, node.axes, node.keys, node.rels)
-        self.notes = (*self.notes, guess_warning(model))
-        return model
 
     def _find_part(self, finder: DeviceFinder, link: PadLink, ending: str | None, nodes: list[NodeInfo]) -> None:
         """Open another device of the same pad: the one whose name has that ``ending``."""
@@ -243,11 +241,6 @@ class EvdevPad(GamepadDriver):
             return False
         self._rumble = strong, weak, seconds
         return True
-
-    def _play_rumble(self, link: PadLink) -> None:
-        wanted, self._rumble = self._rumble, None
-        if wanted is not None:
-            link.rumble(*wanted)
 
     @property
     def mapping(self) -> str | None:

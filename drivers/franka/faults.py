@@ -267,7 +267,9 @@ def fault_of_exception(
         return _fault_of_flags(names, _rate_in(text), realtime_kernel)
     mode = re.search(r'in the current mode \("(\w[\w ]*)"\)', text)
     if mode is not None:
-        return fault_of((), mode[1]) or _busy_fault(mode[1])
+        state = "moving already" if _plain(mode[1]) == "move" else "idle, but refuses"
+        busy = f"the robot refused a command: it is {state}"
+        return fault_of((), mode[1]) or Fault("busy", busy, "end the motion first, or wait a moment")
     known = _known_error_in(text)
     if known is not None:
         if known is REFUSED and port == HAND_PORT:
@@ -350,11 +352,6 @@ def _plain(mode: str) -> str:
     if re.match(r"k[A-Z]", name):
         name = name[1:]
     return re.sub(r"[^a-z]", "", name.lower())
-
-
-def _busy_fault(mode: str) -> Fault:
-    state = "moving already" if _plain(mode) == "move" else "idle, but refuses"
-    return Fault("busy", f"the robot refused a command: it is {state}", "end the motion first, or wait a moment")
 
 
 def _versions_in(error: BaseException, text: str) -> tuple[int, int] | None:

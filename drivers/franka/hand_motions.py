@@ -455,14 +455,12 @@ class HandController:
             return HandAction.RECONNECT
         if now > running.deadline and self._command is not None and self._command.accepts(running.call, state):
             self._fail(_no_answer_fault(running.call.method, running.call.bound))
-        if self._may_continue(running.call, state):
+        # Without a command, only a grasp that presses on an object continues: a stop could release it.
+        serves = running.call.method == "grasp" and is_holding(state)
+        if self._command is not None:
+            serves = self._command.accepts(running.call, state)
+        if serves:
             return None
         running.stopped_at = now
         self._stop_check = _StopCheck(now + _SETTLE_TIME, state.width, is_holding(state))
         return HandAction.STOP
-
-    def _may_continue(self, call: GripperCall, state: HandState) -> bool:
-        """Without a command, only a grasp that presses on an object continues: a stop could release it."""
-        if self._command is None:
-            return call.method == "grasp" and is_holding(state)
-        return self._command.accepts(call, state)

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import fields
 from types import MappingProxyType
 from typing import Any
 
@@ -383,27 +384,14 @@ def _copy(error: ConnectionLost) -> ConnectionLost:
 def _info_from(opened: Mapping[str, Any]) -> CameraInfo:
     """Return the camera's record, from the plain data of :meth:`.device.RealSenseDevice.open`."""
     streams = {
-        name: StreamInfo(
-            format=stream["format"],
-            width=stream["width"],
-            height=stream["height"],
-            rate_hz=stream["rate_hz"],
-            K=freeze(stream["K"]),
-            distortion=freeze(stream["distortion"]),
-            T_color_stream=Pose(*stream["T_color_stream"]),
-        )
+        name: StreamInfo(**_freeze_arrays({**stream, "T_color_stream": Pose(*stream["T_color_stream"])}))
         for name, stream in opened["streams"].items()
     }
-    return CameraInfo(
-        title=opened["title"],
-        K=freeze(opened["K"]),
-        distortion=freeze(opened["distortion"]),
-        K_infrared=freeze(opened["K_infrared"]) if opened["K_infrared"] is not None else None,
-        clock=opened["clock"],
-        serial=opened["serial"],
-        firmware=opened["firmware"],
-        usb=opened["usb"],
-        depth_scale=opened["depth_scale"],
-        streams=MappingProxyType(streams),
-        options=MappingProxyType(dict(opened["options"])),
-    )
+    known = {field.name: opened[field.name] for field in fields(CameraInfo)}
+    tables = {"streams": MappingProxyType(streams), "options": MappingProxyType(opened["options"])}
+    return CameraInfo(**_freeze_arrays({**known, **tables}))
+
+
+def _freeze_arrays(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a record, with lists as arrays."""
+    return {key: freeze(value) if isinstance(value, list) else value for key, value in record.items()}

@@ -132,10 +132,7 @@ class RealSenseDevice:
                 raise ConnectionLost(text, code=lost.code if lost is not None else "unplayable")
             raise ConnectionLost(f"{camera} was started and sent nothing within {_FIRST_SET:g} s", code="no_frames")
         return {
-            "title": camera.title,
-            "serial": camera.serial,
-            "firmware": camera.firmware,
-            "usb": camera.usb,
+            **{key: getattr(camera, key) for key in ("title", "serial", "firmware", "usb")},
             "clock": started.clock,
             "options": option_values,
             "notes": list(notes),

@@ -215,7 +215,7 @@ def apply_options(sensors: Sensors, wanted: Mapping[str, Any]) -> tuple[str, ...
         NotSupported: For an option that the camera lacks (lists those that it has), for a value out of its range, and
             for one that the camera does not keep.
     """
-    assignments = sorted(_resolve(sensors, wanted), key=_rank)
+    assignments = sorted(_resolve(sensors, wanted), key=lambda one: (*_FIRST, one.name).index(one.name))
     notes = []
     for assignment in assignments:
         automatic = _AUTOMATIC.get(assignment.name)
@@ -261,10 +261,6 @@ def _list_options(sensor: Any) -> Iterator[tuple[str, Any]]:
 
 def _find_option(sensor: Any, name: str) -> Any | None:
     return next((option for known, option in _list_options(sensor) if known == name), None)
-
-
-def _rank(assignment: _Assignment) -> int:
-    return _FIRST.index(assignment.name) if assignment.name in _FIRST else len(_FIRST)
 
 
 def _resolve(sensors: Sensors, wanted: Mapping[str, Any]) -> Iterator[_Assignment]:

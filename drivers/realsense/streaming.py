@@ -492,7 +492,8 @@ class FrameStreamer:
         t, t_device = self._times(first.stamp, first.domain, capture.arrival, capture.wall)
         seq = self._numbers(first.number)
         written = 0
-        if self._is_warm(capture.arrival) and self._wait_for_room():
+        self._warm_since = capture.arrival if self._warm_since is None else self._warm_since
+        if capture.arrival - self._warm_since >= self._warm_up and self._wait_for_room():
             self._converter.convert(capture.frames, capture.single, self._ring.open_slot())
             written = self._ring.publish(t, t_device, seq, measure_skew(capture.stamps))
         self._notify({"frame": written})
@@ -500,11 +501,6 @@ class FrameStreamer:
             with self._changed:
                 self._started = StreamStart(first.domain, self._before)
                 self._changed.notify_all()
-
-    def _is_warm(self, now: float) -> bool:
-        if self._warm_since is None:
-            self._warm_since = now
-        return now - self._warm_since >= self._warm_up
 
     def _wait_for_room(self) -> bool:
         """Wait, where every capture counts, until the ring has room; False if the thread is to end."""

@@ -20,7 +20,7 @@ from hal.host.memory import SeriesBox
 from hal.host.process import Channel, SharedMemory, serve
 from hal.host.records import GroupMemory
 from hal.host.scheduling import yield_to_others
-from hal.specs import GroupSpec, WorldSpec, from_json
+from hal.specs import GroupSpec, from_json
 from hal.types import Limited, Trip
 
 from .guard import HOST, start_server
@@ -57,39 +57,14 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     server = start_server(PORT, config["label"], config["secret"])
     page = ViewerPage(server, [from_json(GroupSpec, group) for group in config["groups"]], memories)
     channel.send({"ready": {"address": f"http://{HOST}:{server.get_port()}", "notes": page.notes}})
-    reporter = GoalReporter(channel, page)
 
     def update() -> float:
         due = time.monotonic() + (_FRAME if page.watched else _IDLE)
         page.update()
-        reporter.report()
+        page.report(channel)
         return max(0.0, due - time.monotonic())
 
     serve(channel, {"clear": page.clear_goal, "edited": page.note_edit}, update)
-
-
-class GoalReporter:
-    """Sends the goals of the handles, and a press of *Stop*, to the app."""
-
-    def __init__(self, channel: Channel, page: ViewerPage) -> None:
-        self._channel = channel
-        self._page = page
-        self._sent: dict[str, int] = {}
-        self._due = 0.0
-
-    def report(self) -> None:
-        """Send what changed; goals also periodically. Raises ConnectionLost when the app is gone."""
-        if self._page.stop.is_set():
-            self._page.stop.clear()
-            self._channel.send({"stop": True})
-        goals = {arm.spec.name: goal for arm in self._page.arms if (goal := arm.drag.goal) is not None}
-        numbers = {robot: goal.seq for robot, goal in goals.items()}
-        now = time.monotonic()
-        if numbers == self._sent and (not goals or now < self._due):
-            return
-        self._sent, self._due = numbers, now + _REPEAT
-        poses = {robot: [goal.seq, *goal.position, *goal.orientation] for robot, goal in goals.items()}
-        self._channel.send({"goals": poses, "t": now})
 
 
 class ViewerPage:
@@ -101,7 +76,9 @@ class ViewerPage:
         self.stop = threading.Event()
         """Set when *Stop* was pressed."""
         self._server = server
-        self._due = 0.0
+        self._due = self._report_due = 0.0
+        self._sent: dict[str, int] = {}
+        """Numbers of the goals that were sent last."""
         self.world: BodiesView | None = None
         arms: list[tuple[ArmView, GroupMemory]] = []
         found = [GroupMemory.of(shared.buffer, group) for group, shared in zip(groups, memories, strict=True)]
@@ -120,7 +97,8 @@ class ViewerPage:
                 except HalError as error:
                     self.notes.append(f"the world is not drawn: {error}")
         self.arms = [arm for arm, _ in arms]
-        if not any(group.world is not None and _has_floor(group.world) for group in groups):
+        bodies = [body for group in groups if group.world is not None for body in group.world.bodies]
+        if not any(body.shape == "plane" and body.visible for body in bodies):
             server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
         _set_camera(server, [arm.spec.base_position for arm in self.arms])
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="small")
@@ -150,6 +128,24 @@ class ViewerPage:
         for arm in self.arms:
             if arm.spec.name == robot:
                 arm.drag.clear()
+
+    def report(self, channel: Channel) -> None:
+        """Send the goals of the handles, when they change and periodically, and a press of *Stop*, to the app.
+
+        Raises:
+            ConnectionLost: The app is gone.
+        """
+        if self.stop.is_set():
+            self.stop.clear()
+            channel.send({"stop": True})
+        goals = {arm.spec.name: goal for arm in self.arms if (goal := arm.drag.goal) is not None}
+        numbers = {robot: goal.seq for robot, goal in goals.items()}
+        now = time.monotonic()
+        if numbers == self._sent and (not goals or now < self._report_due):
+            return
+        self._sent, self._report_due = numbers, now + _REPEAT
+        poses = {robot: [goal.seq, *goal.position, *goal.orientation] for robot, goal in goals.items()}
+        channel.send({"goals": poses, "t": now})
 
     def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Note an edit of the simulated world; it is shown with the snapshot of its revision."""
@@ -232,10 +228,6 @@ def arm_status(arm: ArmView, age: float) -> str:
     if goal is not None:
         lines.append(f"goal: {1000 * dist(state.tcp.position, goal.position):.0f} mm away")
     return "  \n".join(lines)
-
-
-def _has_floor(world: WorldSpec) -> bool:
-    return any(body.shape == "plane" and body.visible for body in world.bodies)
 
 
 def _set_camera(server: ViserServer, bases: Sequence[Sequence[float]]) -> None:

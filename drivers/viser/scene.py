@@ -229,25 +229,22 @@ class BodiesView:
 
     def _draw_changes(self) -> None:
         """Draw the bodies that are new or look different, and remove those that are gone."""
-        bodies = {name: body for name, body in self._world.bodies.items() if isinstance(body.spec, BodySpec)}
         for name, (body, visuals, _) in tuple(self._drawn.items()):
-            if bodies.get(name) is not body or body.visuals is not visuals:
+            if self._world.bodies.get(name) is not body or body.visuals is not visuals:
                 del self._drawn[name]
                 self._scene.remove_by_name(f"/bodies/{name}")
-        for name, body in bodies.items():
-            if name not in self._drawn and body.spec.visible:
-                self._drawn[name] = body, body.visuals, self._draw(body)
+        for name, body in self._world.bodies.items():
+            if name not in self._drawn and isinstance(body.spec, BodySpec) and body.spec.visible:
+                self._drawn[name] = body, body.visuals, self._draw(body, body.spec)
 
-    def _draw(self, body: DrawnBody) -> list[SceneNodeHandle]:
+    def _draw(self, body: DrawnBody, spec: BodySpec) -> list[SceneNodeHandle]:
         """Draw a body; return the frames of its links."""
         root = f"/bodies/{body.name}"
-        if body.spec.shape == "plane":
-            self._scene.add_grid(
-                root, 6.0, 6.0, cell_size=0.25, position=body.spec.position, wxyz=_wxyz(body.spec.orientation)
-            )
+        if spec.shape == "plane":
+            self._scene.add_grid(root, 6.0, 6.0, cell_size=0.25, position=spec.position, wxyz=_wxyz(spec.orientation))
             return []
         self._scene.add_frame(root, show_axes=False)
-        nodes = []
+        nodes: list[SceneNodeHandle] = []
         for link in range(len(body.links)):
             nodes.append(self._scene.add_frame(f"{root}/{link}", show_axes=False))
             shapes = [visual for visual in body.visuals if visual.link == link]

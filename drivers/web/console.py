@@ -76,7 +76,11 @@ class WebConsole(Console):
         self._closed = False
         self._recovering = threading.Lock()
         groups = rig.shared_states()
-        self._shown = [_with_shown_stream(camera) for camera in rig.plan.cameras if _shown_stream(camera)]
+        self._shown = [
+            replace(camera, streams=(stream,))
+            for camera in rig.plan.cameras
+            if (stream := next((one for one in _STREAMS if one in camera.streams), None)) is not None
+        ]
         self._frames = SharedMemory(frame_rings_size(self._shown))
         self._rings = frame_rings(self._frames.buffer, self._shown)
         config = {
@@ -114,7 +118,7 @@ class WebConsole(Console):
     def tunnel(self) -> str:
         return ssh_tunnel(self._address, self._port) if is_loopback(self._address) else ""
 
-    # The pad's side, see PadSource.
+    # The pad's side, see WebPad.
 
     @property
     def driver(self) -> str | None:
@@ -372,16 +376,6 @@ class ProcessChannel:
 
 
 # What the process and its pages get as JSON.
-
-
-def _shown_stream(camera: CameraSpec) -> str | None:
-    return next((stream for stream in _STREAMS if stream in camera.streams), None)
-
-
-def _with_shown_stream(camera: CameraSpec) -> CameraSpec:
-    stream = _shown_stream(camera)
-    assert stream is not None
-    return replace(camera, streams=(stream,))
 
 
 def _rig_message(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Callable, Collection
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
 from hal.views import ACTIONS, FRAMES, SETTINGS
@@ -71,30 +71,14 @@ class StopRequest(NamedTuple):
     """Stop every arm: ``rig.stop()``."""
 
 
-class RecoverRequest(NamedTuple):
-    """Clear the fault of a robot."""
+class DriverRequest(NamedTuple):
+    """A request to the app that only the page in control may make."""
 
-    robot: str
-
-
-class TourRequest(NamedTuple):
-    """Play the recorded tour (True), or end it."""
-
-    play: bool
-
-
-class RecordingRequest(NamedTuple):
-    """Press one of the buttons of a recording."""
-
-    action: str
-    """One of ``hal.views.ACTIONS``."""
-
-
-class SettingRequest(NamedTuple):
-    """Change one of ``hal.views.SETTINGS``."""
-
-    name: str
-    value: str | float
+    what: str
+    """The request, in words."""
+    message: dict[str, Any]
+    """What the app gets: ``recover``, a robot; ``demo``, whether to play the recorded tour; ``action``, one of
+    ``hal.views.ACTIONS``; ``setting``, one of ``hal.views.SETTINGS``, and its ``value``."""
 
 
 class WatchRequest(NamedTuple):
@@ -109,18 +93,7 @@ class PictureDrawn(NamedTuple):
     camera: str
 
 
-PageMessage = (
-    PadMessage
-    | PageLeft
-    | ControlRequest
-    | StopRequest
-    | RecoverRequest
-    | TourRequest
-    | RecordingRequest
-    | SettingRequest
-    | WatchRequest
-    | PictureDrawn
-)
+PageMessage = PadMessage | PageLeft | ControlRequest | StopRequest | DriverRequest | WatchRequest | PictureDrawn
 
 encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 """Return a message as JSON text; ValueError for a number that is not finite."""
@@ -179,11 +152,17 @@ def _pad_message(_: _Names, seen: object, since: object, axes: object, buttons: 
     )
 
 
-def _setting(known: _Names, name: object, value: object) -> SettingRequest:
+def _setting(known: _Names, name: object, value: object) -> DriverRequest:
     name = _one_of(name, SETTINGS)
     if name == "speed":
-        return SettingRequest(name, _number(value, _MIN_SPEED, 1.0))
-    return SettingRequest(name, _one_of(value, {"robot": known.robots, "frame": FRAMES, "scene": ("reset",)}[name]))
+        value = _number(value, _MIN_SPEED, 1.0)
+    else:
+        value = _one_of(value, {"robot": known.robots, "frame": FRAMES, "scene": ("reset",)}[name])
+    return DriverRequest("change settings", {"setting": name, "value": value})
+
+
+def _request(what: str, key: str, value: object) -> DriverRequest:
+    return DriverRequest(what, {key: value})
 
 
 def _watch(known: _Names, cameras: object) -> WatchRequest:
@@ -197,9 +176,9 @@ _MESSAGES: dict[str, tuple[set[str], Callable[..., PageMessage]]] = {
     "away": ({"why"}, lambda _, why: PageLeft(_LEFT[_one_of(why, _LEFT)])),
     "lease": ({"take"}, lambda _, take: ControlRequest(_flag(take))),
     "stop": (set(), lambda _: StopRequest()),
-    "recover": ({"robot"}, lambda known, robot: RecoverRequest(_one_of(robot, known.robots))),
-    "demo": ({"play"}, lambda _, play: TourRequest(_flag(play))),
-    "action": ({"action"}, lambda _, action: RecordingRequest(_one_of(action, ACTIONS))),
+    "recover": ({"robot"}, lambda known, robot: _request("clear a fault", "recover", _one_of(robot, known.robots))),
+    "demo": ({"play"}, lambda _, play: _request("play the tour", "demo", _flag(play))),
+    "action": ({"action"}, lambda _, action: _request("steer the recording", "action", _one_of(action, ACTIONS))),
     "setting": ({"name", "value"}, _setting),
     "watch": ({"cameras"}, _watch),
     "drawn": ({"camera"}, lambda known, camera: PictureDrawn(_one_of(camera, known.cameras))),

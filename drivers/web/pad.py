@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 from hal import registry
 from hal.driver import GamepadDriver, PadReading
@@ -83,26 +83,8 @@ class PadQueue:
             return self._last
 
 
-class PadSource(Protocol):
-    """The part of the console that :class:`WebPad` uses."""
-
-    def subscribe(self) -> PadQueue:
-        """Return a queue that gets every reading from now on; each web pad of a rig has its own."""
-
-    @property
-    def driver(self) -> str | None:
-        """Name of the page in control; None if there is none."""
-
-    @property
-    def stop_count(self) -> int:
-        """Number that grows with every ``rig.stop()``."""
-
-    def show_playing(self, on: bool) -> None:
-        """Show on the pages whether the recorded tour is playing."""
-
-
 class WebPad(GamepadDriver):
-    """The pad of the page in control; ``source`` is a :class:`PadSource`, the rig's console.
+    """The pad of the page in control; ``source`` is the rig's console (:class:`~.console.WebConsole`).
 
     The page's main thread sends the whole pad 50 times a second, and each message proves when the page was alive at the
     latest (:class:`~.session.PadWatch`), so silence is noticed: a frozen browser, a hidden tab and a cut cable all stop
@@ -116,6 +98,7 @@ class WebPad(GamepadDriver):
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
+        self._console: Any = source
         self._queue = PadQueue()
         self._reported = lost_reading(-math.inf, 0)
         self._lost_until = -math.inf
@@ -125,11 +108,6 @@ class WebPad(GamepadDriver):
         self._wanted: bool | None = None
         """Whether to start (True) or end the tour in the next poll; None for neither."""
         self._open = False
-
-    @property
-    def _console(self) -> PadSource:
-        source: PadSource = self.source  # type: ignore[assignment]  # checked by open
-        return source
 
     def open(self) -> None:
         if not hasattr(self.source, "subscribe"):

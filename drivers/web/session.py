@@ -1,8 +1,7 @@
 """The rules of the console, without any socket: which page drives, whose pad counts, what the app and pages are sent.
 
-The parts, from the inside out: :class:`PadWatch` decides whether a pad message is recent enough to count,
-:class:`DriveLease` which page is in control, :class:`SendQueue` holds what waits to be sent to one page, and
-:class:`WebSession` connects them.
+:class:`PadWatch` decides whether a pad message is recent enough to count, :class:`SendQueue` holds what waits for one
+page, and :class:`WebSession` connects them, and knows which page is in control.
 """
 
 from __future__ import annotations
@@ -22,15 +21,12 @@ from .messages import (
     PAGE_GONE,
     PAGE_SILENT,
     ControlRequest,
+    DriverRequest,
     MalformedMessage,
     Outbox,
     PadMessage,
     PageLeft,
-    RecordingRequest,
-    RecoverRequest,
-    SettingRequest,
     StopRequest,
-    TourRequest,
     encode,
     parse,
 )
@@ -119,56 +115,6 @@ class PadWatch:
         return why if was else None
 
 
-# Who drives.
-
-
-class LeaseChange(NamedTuple):
-    """Control passed from one page to another, or to none."""
-
-    before: str | None
-    """Name of the page that was in control."""
-    driver: str | None
-    """Name of the page that is in control now."""
-    t: float
-    """Time of the change, in s."""
-    why: str
-    """The reason, for people; empty if no page lost control."""
-
-
-class DriveLease:
-    """The right to drive: one page at a time. Pages have names that are never used twice.
-
-    Each grant makes a new :class:`PadWatch`, so that messages of a page without control, or of its last time in
-    control, do not count.
-    """
-
-    def __init__(self) -> None:
-        self.driver: str | None = None
-        self.watch: PadWatch | None = None
-        """Judges the pad of :attr:`driver`; None while no page is in control."""
-        self.why = ""
-        """Reason of the newest change."""
-
-    def grant(self, page: str, now: float) -> LeaseChange | None:
-        """Give control to ``page``, whichever page has it. None if that page has it already."""
-        if page == self.driver:
-            return None
-        return self._change(page, now, f"{page} took control" if self.driver is not None else "")
-
-    def release(self, page: str, now: float, why: str) -> LeaseChange | None:
-        """End the control of ``page``. None if it is not in control."""
-        return self._change(None, now, why) if page == self.driver else None
-
-    def watch_of(self, page: str) -> PadWatch | None:
-        """Return the watch of this page's pad; None if it is not in control."""
-        return self.watch if page == self.driver else None
-
-    def _change(self, driver: str | None, now: float, why: str) -> LeaseChange:
-        before, self.driver, self.why = self.driver, driver, why
-        self.watch = PadWatch(now) if driver is not None else None
-        return LeaseChange(before, driver, now, why)
-
-
 # What waits to be sent.
 
 
@@ -243,7 +189,12 @@ class WebSession:
         self._flush = flush
         self._clock = clock
         self._opened = 0
-        self._lease = DriveLease()
+        self._driver: str | None = None
+        """Name of the page in control: one at a time, and no name is used twice."""
+        self._watch: PadWatch | None = None
+        """Judges the pad of that page; a new one with each grant, so that messages from before do not count."""
+        self._why = ""
+        """Reason of the last change of control, for people; empty if no page lost it."""
         self._labels: str | None = None
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
         self._waiting_for: list[str] = []
@@ -261,7 +212,7 @@ class WebSession:
         self._opened += 1
         page = WebPage(self._opened, overflow)
         self.pages[page.name] = page
-        page.queue.put_note(self._hello(page))
+        page.queue.put_note(encode({"type": "hello", "page": page.number, "name": page.name, "rig": self._rig}))
         if self._labels is not None:
             page.queue.put_note(self._labels)
         if self._driving is not None:
@@ -274,13 +225,10 @@ class WebSession:
             page.queue.put_newest("recording", self._recording)
         return page
 
-    def _hello(self, page: WebPage) -> str:
-        return encode({"type": "hello", "page": page.number, "name": page.name, "rig": self._rig})
-
     def close_page(self, page: WebPage) -> None:
         """Remove a page and end its control. Idempotent."""
-        if self.pages.pop(page.name, None) is not None:
-            self._apply(self._lease.release(page.name, self._clock(), PAGE_GONE))
+        if self.pages.pop(page.name, None) is not None and page.name == self._driver:
+            self._set_driver(None, PAGE_GONE)
 
     # Messages of pages.
 
@@ -299,14 +247,8 @@ class WebSession:
             self._disconnect_pad(page, message.why)
         elif isinstance(message, ControlRequest):
             self._take_or_release(page, message.take)
-        elif isinstance(message, RecoverRequest):
-            self._request(page, {"recover": message.robot, "page": page.name}, "clear a fault")
-        elif isinstance(message, TourRequest):
-            self._play_tour(page, message.play)
-        elif isinstance(message, RecordingRequest):
-            self._steer_recording(page, message.action)
-        elif isinstance(message, SettingRequest):
-            self._change_setting(page, message)
+        elif isinstance(message, DriverRequest):
+            self._request(page, message)
         else:
             raise MalformedMessage("not on this socket")
 
@@ -316,7 +258,7 @@ class WebSession:
         self._flush()
 
     def _receive_pad(self, page: WebPage, message: PadMessage) -> None:
-        watch = self._lease.watch_of(page.name)
+        watch = self._watch if page.name == self._driver else None
         if watch is None:
             return  # it was on its way when the page lost control
         now = self._clock()
@@ -333,7 +275,7 @@ class WebSession:
         page.queue.put_newest("beat", encode({"type": "beat", "t": watch.stamp(now)}))
 
     def _disconnect_pad(self, page: WebPage, why: str) -> None:
-        watch = self._lease.watch_of(page.name)
+        watch = self._watch if page.name == self._driver else None
         if watch is not None and watch.disconnect(why) is not None:
             self._lose_pad(self._clock(), why)
 
@@ -343,56 +285,47 @@ class WebSession:
         self._flush()
 
     def _take_or_release(self, page: WebPage, take: bool) -> None:
-        now = self._clock()
-        if not take:
-            self._apply(self._lease.release(page.name, now, f"{page.name} released control"))
-        elif not self._rig["drivable"]:
+        drives = page.name == self._driver
+        if not take and drives:
+            self._set_driver(None, f"{page.name} released control")
+        elif take and not self._rig["drivable"]:
             self._refuse(page, f"a page cannot drive this rig: {self._rig['driven_by']} drives it")
-        else:
-            self._apply(self._lease.grant(page.name, now))
+        elif take and not drives:
+            self._set_driver(page.name, f"{page.name} took control" if self._driver is not None else "")
 
-    def _play_tour(self, page: WebPage, play: bool) -> None:
-        if not self._rig["demo"]:
-            self._refuse(page, "this rig has no recorded tour to play")
-        else:
-            self._request(page, {"demo": play, "page": page.name}, "play the tour")
-
-    def _steer_recording(self, page: WebPage, action: str) -> None:
-        if self._lease.driver == page.name and action not in self._actions:
-            self._refuse(page, "that cannot be done now" if self._recording else "this program records nothing")
-        else:
-            self._request(page, {"action": action, "page": page.name}, "steer the recording")
-
-    def _change_setting(self, page: WebPage, setting: SettingRequest) -> None:
-        if self._lease.driver == page.name and setting.name not in self._settings:
-            self._refuse(page, f"this program does not let a page set the {setting.name}")
-        else:
-            message = {"setting": setting.name, "value": setting.value, "page": page.name}
-            self._request(page, message, "change settings")
-
-    def _request(self, page: WebPage, message: dict[str, Any], what: str) -> None:
-        if self._lease.driver != page.name:
-            self._refuse(page, f"only the page in control may {what}")
-        elif not self._to_app.put(message):
-            self._refuse(page, "the program does not answer")
+    def _request(self, page: WebPage, request: DriverRequest) -> None:
+        wanted, why = request.message, ""
+        if "demo" in wanted and not self._rig["demo"]:
+            why = "this rig has no recorded tour to play"
+        elif self._driver != page.name:
+            why = f"only the page in control may {request.what}"
+        elif wanted.get("action", "") not in ("", *self._actions):
+            why = "that cannot be done now" if self._recording else "this program records nothing"
+        elif wanted.get("setting", "") not in ("", *self._settings):
+            why = f"this program does not let a page set the {wanted['setting']}"
+        elif not self._to_app.put({**wanted, "page": page.name}):
+            why = "the program does not answer"
+        if why:
+            self._refuse(page, why)
         else:
             self._flush()
 
     # Changes of control.
 
-    def _apply(self, change: LeaseChange | None) -> None:
-        if change is None:
-            return
-        if change.before is not None:
-            self._lose_pad(change.t, change.why)
-        self._to_app.put_newest("driver", {"driver": change.driver})
+    def _set_driver(self, driver: str | None, why: str) -> None:
+        """Give control to a page, or to none; ``why`` is the reason for the page that loses it."""
+        now = self._clock()
+        if self._driver is not None:
+            self._lose_pad(now, why)
+        self._driver, self._why = driver, why
+        self._watch = PadWatch(now) if driver is not None else None
+        self._to_app.put_newest("driver", {"driver": driver})
         self._flush()
         for page in self.pages.values():
-            self._send_lease(page, change.t)
+            self._send_lease(page, now)
 
     def _send_lease(self, page: WebPage, t: float) -> None:
-        you = self._lease.driver == page.name
-        lease = {"type": "lease", "driver": self._lease.driver, "you": you, "t": t, "why": self._lease.why}
+        lease = {"type": "lease", "driver": self._driver, "you": self._driver == page.name, "t": t, "why": self._why}
         page.queue.put_note(encode(lease))
 
     # Messages to pages.
@@ -450,7 +383,7 @@ class WebSession:
 
     def check_pad(self, now: float) -> None:
         """Report the pad as lost if the page in control has been silent for too long; to be called regularly."""
-        watch = self._lease.watch
+        watch = self._watch
         why = watch.check_silence(now) if watch is not None else None
         if why is not None:
             self._lose_pad(now, why)

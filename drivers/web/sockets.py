@@ -161,7 +161,8 @@ class PageSocket:
     def __init__(self, ws: web.WebSocketResponse, transport: asyncio.Transport) -> None:
         self._ws = ws
         self._transport = transport
-        self._sending_since: float | None = None
+        self.sending_since: float | None = None
+        """Since when the page has not read a message, s, monotonic; None while none is being sent."""
         self._receiving: asyncio.Future[CloseReason | None] | None = None
         self.app_ended = False
         """Whether :meth:`end` was called."""
@@ -180,16 +181,12 @@ class PageSocket:
 
     async def send(self, message: str | bytes) -> None:
         """Send a message; returns when the kernel has taken it. ConnectionError if the page is gone."""
-        self._sending_since = time.monotonic()
+        self.sending_since = time.monotonic()
         if isinstance(message, str):
             await self._ws.send_str(message)
         else:
             await self._ws.send_bytes(message)
-        self._sending_since = None
-
-    def is_stuck(self, now: float) -> bool:
-        """Whether the page has read nothing for too long at ``now`` (s, monotonic)."""
-        return self._sending_since is not None and now - self._sending_since > _SEND_TIME
+        self.sending_since = None
 
     def abort(self) -> None:
         """Break the connection without a close."""
@@ -293,7 +290,7 @@ class PageSockets(ABC):
     def abort_stuck(self, now: float) -> None:
         """Abort every page that does not read what it is sent; ``now`` in s, monotonic."""
         for sock in self._sockets:
-            if sock.is_stuck(now):
+            if sock.sending_since is not None and now - sock.sending_since > _SEND_TIME:
                 sock.abort()
 
     async def close(self) -> None:

@@ -343,7 +343,8 @@ def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folde
     file: Path | str = "<dict>"
     data: Any = given
     if not isinstance(given, Mapping):
-        file = find_file(given, kind.replace("_", " "), Path.cwd(), "config", folder)
+        name = given if isinstance(given, Path) else str(given)
+        file = find_file(name, kind.replace("_", " "), Path.cwd(), "config", folder)
         if isinstance(file, str):
             raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), file, f"unknown_{kind}")])
         data = read_yaml(file, problems)

@@ -36,18 +36,15 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
     with suppress(Unknown):
         streams = resolve_streams(context, key, config, model)
     driver = context.choose_driver("camera", key, config, model)
-    if streams is None or not driver or _has_problems(context, key, file):
+    if streams is None or not driver:
+        return None
+    if any(f"{found.key}.".startswith(f"{key}.") or found.file == str(file) for found in context.problems.found):
         return None
     with suppress(Unknown):
         spec = _make_spec(context, name, config, model, driver, streams, file)
         check_camera_spec(context, key, spec, config, model, file)
         return spec
     return None
-
-
-def _has_problems(context: Context, key: str, file: Path) -> bool:
-    """Return whether there is a problem in the camera's entry or in its model's file."""
-    return any(f"{found.key}.".startswith(f"{key}.") or found.file == str(file) for found in context.problems.found)
 
 
 def _make_spec(

@@ -12,15 +12,12 @@ from hypothesis import strategies as st
 from hal.drivers.web.messages import (
     MAX_BYTES,
     ControlRequest,
+    DriverRequest,
     MalformedMessage,
     PadMessage,
     PageLeft,
     PictureDrawn,
-    RecordingRequest,
-    RecoverRequest,
-    SettingRequest,
     StopRequest,
-    TourRequest,
     WatchRequest,
     encode,
     parse,
@@ -42,11 +39,17 @@ def take(text: str) -> object:
         ({"type": "away", "why": "hidden"}, PageLeft("the page was hidden")),
         *(({"type": "lease", "take": take}, ControlRequest(take)) for take in (True, False)),
         ({"type": "stop"}, StopRequest()),
-        ({"type": "recover", "robot": "panda"}, RecoverRequest("panda")),
-        ({"type": "demo", "play": True}, TourRequest(True)),
-        *(({"type": "action", "action": action}, RecordingRequest(action)) for action in ACTIONS),
+        ({"type": "recover", "robot": "panda"}, DriverRequest("clear a fault", {"recover": "panda"})),
+        ({"type": "demo", "play": True}, DriverRequest("play the tour", {"demo": True})),
         *(
-            ({"type": "setting", "name": name, "value": value}, SettingRequest(name, value))
+            ({"type": "action", "action": action}, DriverRequest("steer the recording", {"action": action}))
+            for action in ACTIONS
+        ),
+        *(
+            (
+                {"type": "setting", "name": name, "value": value},
+                DriverRequest("change settings", {"setting": name, "value": value}),
+            )
             for name, value in (("robot", "panda"), ("speed", 0.25), ("frame", "tcp"), ("scene", "reset"))
         ),
         ({"type": "watch", "cameras": ["wrist", "wrist", "scene"]}, WatchRequest(("wrist", "scene"))),
