@@ -142,10 +142,11 @@ class Compliance:
         self.active = False
         self._torque.smoother.limit_jerk()
 
-    def hold_back(self) -> bool:
+    def hold_back(self, cartesian: bool) -> bool:
         """Bring a set-point that is too far ahead of the arm back to :data:`LEAD`; returns whether it was.
 
-        To be called once per tick, before the set-point moves on.
+        To be called once per tick, before the set-point moves on; ``cartesian``: with the Jacobian, which is then
+        computed here.
         """
         law, smoother, torque = self._law, self._torque.smoother, self._torque
         assert law is not None
@@ -153,9 +154,9 @@ class Compliance:
         most, turn = LEAD
         if law.in_joints and max([abs(a - b) for a, b in zip(goal, q, strict=True)]) > turn:
             goal = [b + max(-turn, min(turn, a - b)) for a, b in zip(goal, q, strict=True)]
-        kinematics = self._envelope.kinematics
-        pose = torque.tcp().pose
-        error = difference(pose, kinematics.fk(goal))
+        kinematics, pose = self._envelope.kinematics, torque.tcp().pose
+        at_goal = cartesian and goal is smoother.q
+        error = difference(pose, self._envelope.pose_and_jacobian()[0] if at_goal else kinematics.fk(goal))
         share = hypot(*error[:3]) / most
         if not law.in_joints and not law.position_only:
             share = max(share, hypot(*error[3:]) / turn)
