@@ -59,7 +59,6 @@ class Kinematics:
         self.lower: Array = np.array(spec.lower, float)
         self.upper: Array = np.array(spec.upper, float)
         self.home: Array = np.array(spec.home, float)
-        self._home: list[float] = self.home.tolist()
         for name, values in (("lower", self.lower), ("upper", self.upper), ("home", self.home)):
             if values.shape != (self.n,):
                 raise ValueError(f"{name} has {values.size} numbers for {self.n} joints")
@@ -131,7 +130,10 @@ class Kinematics:
             if frame not in ("tcp", "space"):
                 raise CommandError(f"frame must be 'base', 'tcp' or 'space', not {frame!r}", code="unknown_frame")
             axes = reference.LOCAL if frame == "tcp" else reference.WORLD
-        number = self._tcp if link is None else self._body_frame(link)
+        return self._frame_jacobian(q, self._tcp if link is None else self._body_frame(link), axes)
+
+    def _frame_jacobian(self, q: Sequence[float] | Array, number: int, axes: Any) -> Array:
+        """Return the Jacobian (6, n) of a frame of pinocchio's along these axes."""
         jacobian: Array = self._pin.computeFrameJacobian(self._model, self._data, self._ordered(q), number, axes)
         if self.n == 1:
             jacobian = jacobian.reshape(6, 1)  # pinocchio returns a vector
@@ -175,7 +177,7 @@ class Kinematics:
 
     def fk_and_jacobian(self, q: Sequence[float] | Array) -> tuple[Pose7, Array]:
         """Return :meth:`fk` and :meth:`jacobian`; together they take little longer than one of them."""
-        jacobian = self.jacobian(q)  # has done the forward kinematics of the joints
+        jacobian = self._frame_jacobian(q, self._tcp, self._axes)  # has done the forward kinematics of the joints
         self._pin.updateFramePlacement(self._model, self._data, self._tcp)
         pose: Pose7 = self._pin.SE3ToXYZQUATtuple(self._tcp_placement)
         return pose, jacobian
@@ -210,7 +212,7 @@ class Kinematics:
             jacobian = self.jacobian(q)
         gram = np.dot(jacobian, jacobian.T, self._gram)
         near = not self._is_surely_regular(q) and self._is_near_singular(q, gram)
-        home = self._pull(q, posture_gain) if self.n > 6 else None  # else there is no null space
+        home = self._pull(q, posture_gain) if self.n > 6 and posture_gain else None  # else there is no null space
         wanted = np.array(twist, float)
         if not near:
             self._llt.compute(gram)
@@ -232,12 +234,12 @@ class Kinematics:
 
     def _pull(self, q: Sequence[float] | Array, gain: float) -> Array | None:
         """Return the speeds (n,) towards home, rad/s; None if they are all 0."""
-        way = [x - y for x, y in zip(self._home, q, strict=True)]
-        farthest = max(map(abs, way))
-        if gain == 0.0 or farthest == 0.0:
+        way: Array = self.home - q
+        farthest = max(map(abs, way.tolist()))
+        if farthest == 0.0:
             return None
-        gain = min(gain, POSTURE_SPEED / farthest)
-        return np.array([gain * x for x in way])
+        way *= min(gain, POSTURE_SPEED / farthest)
+        return way
 
     def _is_near_singular(self, q: Sequence[float] | Array, gram: Array) -> bool:
         """Return whether the Jacobian at ``q`` has a singular value below :data:`NEAR_SINGULAR`; ``gram`` is J J^T."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from math import inf, isnan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,11 +41,13 @@ class SetpointAudit:
             dt * dt * dt * np.array(limits.jerk),
         ]
         self._peaks = [0.0] * 4
-        self._torque_limits = limits.torque
+        self._torque_limits = None if limits.torque is None else np.array(limits.torque)
         self._torque_step = _TORQUE_RATE * dt
         self._torque_peaks: list[float] = []
         """Peaks of torque and of its rate; empty before the first torques."""
-        self._tau: Sequence[float] | None = None
+        self._tau: NDArray[np.float64] = np.empty(0)
+        """The last torques that were judged, Nm; empty at the beginning of a stream of them."""
+        self._pending_tau: list[float] = []
         self._history: NDArray[np.float64] = np.empty((0, len(lower)))
         self._pending: list[float] = []
         self._full = _BATCH * len(lower)
@@ -53,26 +55,32 @@ class SetpointAudit:
     def reset(self) -> None:
         """Forget the history, not the peaks: the next sample begins a new stream (a reset of the world)."""
         self._judge()
+        self._judge_torques()
         self._history = self._history[:0]
-        self._tau = None
+        self._tau = np.empty(0)
 
     def add_setpoint(self, setpoint: Setpoint) -> None:
         """Add a set-point of any kind, as it was handed to the driver."""
-        if setpoint.tau is not None:
-            self._add_torques(setpoint.tau)
+        if setpoint.tau is None:
+            if self._pending_tau or len(self._tau):  # positions start again from where torques moved the arm
+                self.reset()
+            self.add(setpoint.q)
             return
-        if self._tau is not None:  # positions start again from where torques moved the arm
-            self.reset()
-        self.add(setpoint.q)
+        self._pending_tau.extend(setpoint.tau)
+        if len(self._pending_tau) >= self._full:
+            self._judge_torques()
 
-    def _add_torques(self, tau: Sequence[float]) -> None:
-        before = [0.0] * len(tau) if self._tau is None else self._tau
-        self._tau = tau
-        limits = self._torque_limits
-        torque = rate = math.inf
-        if limits is not None and math.isfinite(sum(tau)):
-            torque = max([abs(x) / most for x, most in zip(tau, limits, strict=True)])
-            rate = max([abs(x - y) for x, y in zip(tau, before, strict=True)]) / self._torque_step
+    def _judge_torques(self) -> None:
+        if not self._pending_tau:
+            return
+        tau = np.array(self._pending_tau, float).reshape(-1, len(self._middle))
+        self._pending_tau = []
+        before = self._tau if len(self._tau) else np.zeros(len(self._middle))
+        self._tau = tau[-1]
+        torque = rate = inf
+        if self._torque_limits is not None and np.isfinite(tau).all():
+            torque = float((np.abs(tau) / self._torque_limits).max())
+            rate = float(np.abs(np.diff(tau, axis=0, prepend=before[None])).max()) / self._torque_step
         peaks = self._torque_peaks or [0.0, 0.0]
         self._torque_peaks = [max(peaks[0], torque), max(peaks[1], rate)]
 
@@ -101,7 +109,7 @@ class SetpointAudit:
     def _raise_to(self, which: int, values: NDArray[np.float64], limit: NDArray[np.float64]) -> None:
         ratio = float((np.abs(values).max(axis=0) / limit).max())
         if not ratio <= self._peaks[which]:
-            self._peaks[which] = math.inf if math.isnan(ratio) else ratio
+            self._peaks[which] = inf if isnan(ratio) else ratio
 
     def peaks(self) -> dict[str, float]:
         """Return the greatest ratios so far: ``velocity``, ``acceleration``, ``jerk``, ``position``.
@@ -109,6 +117,7 @@ class SetpointAudit:
         Also ``torque`` and ``torque_rate`` if there were torques.
         """
         self._judge()
+        self._judge_torques()
         position, velocity, acceleration, jerk = self._peaks
         peaks = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk, "position": position}
         return peaks | dict(zip(("torque", "torque_rate"), self._torque_peaks, strict=False))

@@ -48,6 +48,8 @@ _BRAKE = (0.8, 0.5)
 class _CartesianMotion(ServoMotion):
     """Base class of twists and poses."""
 
+    cartesian = True
+
     def _follow_twist(self, twist: list[float]) -> None:
         """Follow a twist (6,) of the tcp for one tick, along the base's axes, m/s and rad/s."""
         envelope, smoother = self.envelope, self.smoother
@@ -93,7 +95,12 @@ class TwistMotion(_CartesianMotion):
 
     def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
         super().__init__(smoother, envelope)
-        self._values: Floats = ()
+        self._twist: list[float] = []
+        """The commanded twist (6,), m/s and rad/s."""
+        self._along_tcp: float = 0.0
+        """Whether it is along the axes of the tcp (not 0)."""
+        self._moving = False
+        """Whether it is not 0."""
         self._goal: list[float] = []
         self._held = [False, False]
         """Whether the goal's position and orientation are held."""
@@ -104,21 +111,23 @@ class TwistMotion(_CartesianMotion):
         self._held = [True, True]
 
     def accept(self, command: CommandRecord) -> None:
-        self._values = command.values
+        *twist, self._along_tcp = command.values
+        if hypot(*twist) > _ABSURD:
+            twist = [max(-_ABSURD, min(_ABSURD, x)) for x in twist]
+        self._twist = twist
+        self._moving = any(twist)
 
     def step(self, now: float) -> None:
-        smoother, envelope = self.smoother, self.envelope
-        if not any(self._values[:6]):
-            smoother.settle(envelope.guard)
+        envelope = self.envelope
+        if not self._moving:
+            self.smoother.settle(envelope.guard)
             self.start()
             return
         pose, _ = envelope.pose_and_jacobian()
         if not self._goal:
             self._goal = list(pose)
-        twist = list(self._values[:6])
-        if hypot(*twist) > _ABSURD:
-            twist = [max(-_ABSURD, min(_ABSURD, x)) for x in twist]
-        if self._values[6]:
+        twist = self._twist
+        if self._along_tcp:
             twist = rotate(pose[3:], twist[:3]) + rotate(pose[3:], twist[3:])
         twist = self._cap(twist)
         self._advance(pose, twist)

@@ -24,7 +24,7 @@ from ..types import ControlMode, Limited
 from .controllers import Controller, ControllerLaw, Position, controller_of
 from .envelope import Envelope
 from .torque import TorqueMotion
-from .torque_bounds import RATE, Inertia
+from .torque_bounds import RATE
 
 __all__ = ["LEAD", "Compliance", "followable_jerk"]
 
@@ -73,14 +73,16 @@ class Compliance:
         self._friction: Floats | None = None
         if simulated and self._dynamics is not None and any(self._dynamics.damping):
             self._friction = self._dynamics.damping
+            # It acts on the speed after the step, so a torque moves M + friction dt.
+            torque.friction = np.diag(self._friction) * torque.smoother.dt
         self._law: ControllerLaw | None = None
         """The law of this session; None if the arm's own position controller follows the set-point."""
         self._jerk: Floats | None = None
         """Jerks (n,) that the torques of this session can follow, rad/s3."""
         self.active = False
         """Whether the controller drives the arm."""
-        self._due: tuple[Floats, Floats] = ((), ())
-        """Set-point of the last tick: positions (n,), rad, and speeds (n,), rad/s, that are due now."""
+        self._due = np.zeros((2, torque.size))
+        """Set-point of the last tick: positions, rad, and speeds (2, n), rad/s, that are due now."""
         self._error: list[float] = []
         """Twist (6,) from the measured pose of the tcp to the set-point's within 1 s."""
         self.held_back = False
@@ -115,8 +117,9 @@ class Compliance:
             self._jerk = followable_jerk(self._dynamics.mass_matrix(smoother.q))
             smoother.limit_jerk(self._jerk)
         self._law = ControllerLaw(
-            controller, smoother.n, smoother.dt, smoother.velocity, self._dynamics, self._friction
-        )
+            controller, smoother.n, smoother.dt, smoother.velocity, self._dynamics, self._friction,
+            hypot(*self._envelope.kinematics.reach()),
+        )  # fmt: skip
         slower = session._replace(speed=min(session.speed, SPEED_SHARE), tcp_speed=TCP_SHARE * session.tcp_speed)
         self._envelope.open(slower)
         torque.open()
@@ -139,10 +142,11 @@ class Compliance:
         self.active = False
         self._torque.smoother.limit_jerk()
 
-    def hold_back(self) -> bool:
+    def hold_back(self, cartesian: bool) -> bool:
         """Bring a set-point that is too far ahead of the arm back to :data:`LEAD`; returns whether it was.
 
-        To be called once per tick, before the set-point moves on.
+        To be called once per tick, before the set-point moves on; ``cartesian``: with the Jacobian, which is then
+        computed here.
         """
         law, smoother, torque = self._law, self._torque.smoother, self._torque
         assert law is not None
@@ -150,9 +154,9 @@ class Compliance:
         most, turn = LEAD
         if law.in_joints and max([abs(a - b) for a, b in zip(goal, q, strict=True)]) > turn:
             goal = [b + max(-turn, min(turn, a - b)) for a, b in zip(goal, q, strict=True)]
-        kinematics = self._envelope.kinematics
-        pose, _ = torque.tcp()
-        error = difference(pose, kinematics.fk(goal))
+        kinematics, pose = self._envelope.kinematics, torque.tcp().pose
+        at_goal = cartesian and goal is smoother.q
+        error = difference(pose, self._envelope.pose_and_jacobian()[0] if at_goal else kinematics.fk(goal))
         share = hypot(*error[:3]) / most
         if not law.in_joints and not law.position_only:
             share = max(share, hypot(*error[3:]) / turn)
@@ -168,7 +172,7 @@ class Compliance:
             smoother.anchor(goal, [rate * v for v in dq], [rate * a for a in smoother.ddq])
             error = difference(pose, kinematics.fk(goal))
             self._envelope.limited |= Limited.LEAD
-        self._due = smoother.q, smoother.dq
+        self._due = np.array((smoother.q, smoother.dq))
         self._error = error
         return moved
 
@@ -180,16 +184,11 @@ class Compliance:
         arm = torque.arm
         if arm is None:  # the last ones are kept, for a bounded time
             return
-        if self._friction is not None:  # it acts on the speed after the step, so a torque moves M + friction dt
-            mass = arm.inertia.mass + np.diag(self._friction) * smoother.dt
-            arm = arm._replace(inertia=Inertia(mass, smoother.n, False))
-        q_due, dq_due = self._due
-        pose, jacobian = torque.tcp()
-        velocity = jacobian[:3].dot(arm.dq)
-        rate = torque.bounds.feeds(velocity) / smoother.dt
-        acceleration = [rate * (new - old) for new, old in zip(smoother.dq, dq_due, strict=True)]
-        tau = law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, self._error)
-        torque.drive(tau, law.gain, arm, velocity)
+        (q_due, dq_due), tcp = self._due, torque.tcp()
+        acceleration = np.array(smoother.dq)
+        acceleration -= dq_due
+        acceleration *= torque.bounds.feeds(tcp.velocity) / smoother.dt
+        torque.drive(law, law.torques(arm, tcp, (q_due, dq_due, acceleration), self._error), arm, tcp.velocity)
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""
@@ -197,7 +196,7 @@ class Compliance:
         bounds, arm = torque.bounds, torque.arm
         if bounds is None or arm is None:
             return None
-        limit = bounds.strays(arm, torque.tcp()[1])
+        limit = bounds.strays(arm, torque.tcp().velocity)
         if limit is None and collisions is not None and not collisions.allows_arm(arm.q, arm.dq, _PUSHED):
             limit = Limited.COLLISION
         return limit

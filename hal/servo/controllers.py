@@ -32,11 +32,11 @@ from numpy.typing import ArrayLike, NDArray
 from ..arguments import number, vector
 from ..errors import CommandError
 from ..types import ControlMode
-from .torque_bounds import RATE, Inertia
+from .torque_bounds import RATE, ArmInMotion, Inertia, TcpInMotion
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
-    from ..kinematics.arm import Kinematics, Pose7
+    from ..kinematics.arm import Kinematics
     from ..specs import RobotSpec
 
 __all__ = [
@@ -323,6 +323,7 @@ class ControllerLaw:
         velocity: Greatest joint speeds (n,), rad/s; not needed to ask for :meth:`fastest`.
         dynamics: The arm's dynamics, for the Coriolis torques; without it there are none.
         friction: Viscous friction (n,) of the joints that is to be compensated, Nm s/rad; None for none.
+        reach: Greatest speed of the tcp at joint speeds of length 1, m/rad.
     """
 
     def __init__(
@@ -333,8 +334,10 @@ class ControllerLaw:
         velocity: Floats = (),
         dynamics: Dynamics | None = None,
         friction: Floats | None = None,
+        reach: float = inf,
     ) -> None:
         self._dt = dt
+        self._reach = reach if isinstance(controller, JointImpedance) else 1.0
         self._most = 1.5 * (_FASTEST / dt) ** 2
         """Greatest square of a mode's natural frequency, 1/s2: a faster one is softened."""
         self._dynamics = dynamics
@@ -360,6 +363,7 @@ class ControllerLaw:
         self._eigen: Any = eigenpy.SelfAdjointEigenSolver(np.eye(self._rows))
         self._llt: Any = eigenpy.LLT(np.eye(self._rows))
         self._unit = np.eye(n)
+        self._eigen_mass: Any = eigenpy.SelfAdjointEigenSolver(self._unit)
         self._lengths = np.zeros((2, self._rows))
         """Lengths of the springs of turn and of position, m and rad."""
         self._posture: Array | None = None
@@ -374,8 +378,13 @@ class ControllerLaw:
         self._fastest = 0.0
         self._modes: Array | None = None
         """The modes: columns, each multiplied by the root of the stiffness; None for those of the springs alone."""
-        self.gain: Array = np.zeros(3)
-        """Velocity (3,) of the tcp, m/s, that the springs of the last call may still add."""
+        self._most_gain = inf
+        """Greatest speed of the tcp, m/s, that springs of length 1 may still add."""
+        self._tau = np.zeros((2, n))
+        self._stretched: Array = np.zeros(3)
+        """Lengths (k,) of the springs in the last call."""
+        self._tcp: TcpInMotion
+        self._turn: Array
         self._goal = self._numbers(controller)
         self._from = self._now = self._goal
         self._ramped = 1.0
@@ -424,26 +433,15 @@ class ControllerLaw:
             ease = rows @ inverse_mass @ rows.T
         return sqrt(float(np.linalg.eigvalsh(ease * self._weights).max()))
 
-    def torques(
-        self,
-        q: Floats,
-        dq: Floats,
-        setpoint: tuple[Floats, Floats, Floats],
-        inertia: Inertia,
-        jacobian: Array,
-        pose: Pose7,
-        error: Floats,
-    ) -> Array:
+    def torques(self, arm: ArmInMotion, tcp: TcpInMotion, setpoint: tuple[Array, Array, Array], error: Floats) -> Array:
         """Return the torques of one period, on top of those that carry the arm's weight.
 
         Args:
-            q: Measured joint positions (n,), rad.
-            dq: Measured joint speeds (n,), rad/s.
+            arm: Measured state.
+            tcp: That of the tcp.
             setpoint: Positions, speeds and accelerations (n,) of the set-point.
-            inertia: Inertia of the arm where it is.
-            jacobian: Jacobian (6, n) of the tcp there, along the base's axes.
-            pose: Pose of the tcp there.
-            error: Twist (6,) from that pose to the set-point's within 1 s, m and rad (:func:`hal.geometry.difference`).
+            error: Twist (6,) from the tcp's pose to the set-point's within 1 s, m and rad
+                (:func:`hal.geometry.difference`).
 
         Returns:
             Two rows (2, n), Nm, whose sum is the controller's. The second is what the springs of the tcp's position
@@ -453,73 +451,83 @@ class ControllerLaw:
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
             self._apply(self._from + self._ramped * (self._goal - self._from))
-        q_now, dq_now, q_set, dq_set, ddq_set = np.array((q, dq, *setpoint))
-        lag: Array = dq_set - dq_now
-        tuned = len(self._tuned_at) > 0 and dist(q, self._tuned_at) <= _SAME_INERTIA
+        q_set, dq_set, ddq_set = setpoint
+        inertia, lag = arm.inertia, dq_set - tcp.dq
+        tuned = len(self._tuned_at) > 0 and dist(arm.q, self._tuned_at) <= _SAME_INERTIA
+        self._tcp = tcp
+        rest: Array = inertia.moved.dot(ddq_set)
+        if self._friction is not None:
+            rest += self._friction * tcp.dq
+        if self._dynamics is not None:
+            rest += self._dynamics.coriolis(tcp.q, tcp.dq)
         if self.in_joints:
             if not tuned:
-                self._tune(q, inertia.solve(self._unit), inertia)
-            lengths = self._shortened(q_set - q_now)
-            tau = np.array((self._damping.dot(lag), lengths.dot(self._stiffness)))
+                self._tune(arm.q, inertia.solve(self._unit), inertia)
+            self._stretched = lengths = self._shortened(q_set - tcp.q)
+            self._tau[0], self._tau[1] = self._damping.dot(lag), lengths.dot(self._stiffness)
         else:
+            task = tcp.jacobian[: self._rows]
             if self._along_tcp:
-                turn = _rotation(pose[3:])
-                jacobian, error = _turned(turn.T, jacobian), _turned(turn.T, np.array(error)).tolist()
-            task = jacobian[: self._rows]
+                self._turn = turn = _rotation(tcp.pose[3:])
+                task, error = _turned(turn.T, task), _turned(turn.T, np.array(error)).tolist()
             eased = inertia.solve(task.T)  # M^-1 J'
-            ease = task.dot(eased) + self._ease
+            ease = task.dot(eased)
+            ease += self._ease
             if not tuned:
-                self._tune(q, ease, inertia)
-            away = (q_set if self._posture is None else self._posture) - q_now
-            tau, lengths = self._task(away, lag, task, eased, ease, error)
-        velocity = self._gain(lengths, max(map(abs, tau[1].tolist())))
-        velocity = jacobian[:3].dot(velocity) if self.in_joints else velocity[:3]
-        self.gain = turn.dot(velocity) if self._along_tcp else velocity
-        tau[0] += inertia.mass.dot(ddq_set)
-        if self._friction is not None:
-            tau[0] += self._friction * dq_now
-        if self._dynamics is not None:
-            tau[0] += self._dynamics.coriolis(q_now, dq_now)
+                self._tune(arm.q, ease, inertia)
+            force = self._force(lag, task, error)
+            if self._redundant:
+                rest += self._posture_torques(q_set, lag, eased, ease, force)
+            force.dot(task, self._tau)
+        tau = self._tau
+        tau[0] += rest
         return tau
 
-    def _task(
-        self, away: Array, lag: Array, jacobian: Array, eased: Array, ease: Array, error: Floats
-    ) -> tuple[Array, Array]:
-        """Return the torques (2, n) of the tcp's springs, with those of the posture in their null space.
-
-        Also the lengths (k,) of the springs of its position.
-        """
+    def _force(self, lag: Array, jacobian: Array, error: Floats) -> Array:
+        """Return the forces (2, k) of the tcp's springs and dampers: those of its position's springs are the second."""
         lengths = self._lengths
         lengths[1, :3] = error[:3]
         if self._rows == 6:
             lengths[0, 3:] = error[3:]
             self._shortened(lengths[0])
-        force = lengths.dot(self._stiffness)
+        force: Array = lengths.dot(self._stiffness)
         force[0] += self._damping.dot(jacobian.dot(lag))
-        if not self._redundant:
-            return np.asarray(force.dot(jacobian), np.float64), lengths[1]
-        posture = self._posture_stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
-        posture += self._posture_damping.dot(lag)
+        self._stretched = lengths[1]
+        return force
+
+    def _posture_torques(self, q_set: Array, lag: Array, eased: Array, ease: Array, force: Array) -> Array:
+        """Return the torques (n,) of the posture, and take what they would move the tcp with off ``force`` (2, k)."""
+        away = (q_set if self._posture is None else self._posture) - self._tcp.q
+        if away.dot(away) > _POSTURE_LEAD * _POSTURE_LEAD:
+            np.clip(away, -_POSTURE_LEAD, _POSTURE_LEAD, out=away)
+        posture: Array = self._posture_damping.dot(lag)
+        away *= self._posture_stiffness
+        posture += away
         self._llt.compute(ease)
         force[0] -= self._llt.solve(posture.dot(eased))
-        tau: Array = force.dot(jacobian)
-        tau[0] += posture
-        return tau, lengths[1]
+        return posture
 
-    def _gain(self, lengths: Array, most: float) -> Array:
-        """Return the velocity (k,) that springs of these lengths may still add if all torques are removed from now.
+    @property
+    def most_gain(self) -> float:
+        """Upper bound of the length of :meth:`gain`, m/s."""
+        lengths = self._stretched
+        return self._most_gain * sqrt(lengths.dot(lengths))
+
+    def gain(self) -> Array:
+        """Return the velocity (3,) of the tcp, m/s, that the springs may add if all torques are removed from now on.
 
         A mode with the natural frequency w gains no more than a critically damped one that is let go: its acceleration
         for 1 / (e w).
-
-        Args:
-            lengths: (k,)
-            most: Greatest torque, Nm.
         """
+        lengths, most = self._stretched, float(np.abs(self._tau[1]).max())
         seconds = np.minimum(2.0 * self._dt + most * (0.5 / RATE), _LET_GO / self._frequencies)
         if self._modes is None:
-            return np.asarray(lengths * self._modal_squares * seconds, np.float64)
-        return np.asarray(self._modes.dot(lengths.dot(self._modes) * self._modal_squares * seconds) / self._gains)
+            velocity = lengths * self._modal_squares * seconds
+        else:
+            velocity = self._modes.dot(lengths.dot(self._modes) * self._modal_squares * seconds) / self._gains
+        if self.in_joints:
+            return np.asarray(self._tcp.jacobian[:3].dot(velocity), np.float64)
+        return np.asarray(self._turn.dot(velocity[:3]) if self._along_tcp else velocity[:3], np.float64)
 
     def _shortened(self, lengths: Array) -> Array:
         """Cut the lengths (k,) of springs, in place, so that none moves what it holds too fast when let go.
@@ -561,13 +569,16 @@ class ControllerLaw:
             if squares[-1] > self._most:  # where the arm is lighter than at home
                 self._stiffness = (modes * np.minimum(1.0, self._most / squares)).dot(modes.T)
         self._fastest = float(self._frequencies.max())
+        stiff = self._gains if self.in_joints else self._gains[:3]
+        self._most_gain = self._reach * _LET_GO * self._fastest * sqrt(float(stiff.max() / stiff.min()))
         if self._redundant:
             # The damping is 2 ratio sqrt(k) M^(1/2), with a little of M. Along any motion z it is at most critical, as
             # z' M^(1/2) z <= sqrt(z' M z) for |z| = 1: the elbow's own motion may have a hundredth of the inertia of
             # the joints that take part in it.
-            squares, axes = np.linalg.eigh(inertia.mass)
+            self._eigen_mass.compute(inertia.moved)
+            squares, axes = self._eigen_mass.eigenvalues(), self._eigen_mass.eigenvectors()
             root = (axes * np.sqrt(np.maximum(squares, 0.0))).dot(axes.T)
-            self._posture_damping = 2.0 * self._ratio * sqrt(self._posture_stiffness) * root + inertia.mass
+            self._posture_damping = 2.0 * self._ratio * sqrt(self._posture_stiffness) * root + inertia.moved
 
 
 def _tuple(gain: Gain | None) -> tuple[float, ...]:

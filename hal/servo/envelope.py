@@ -402,6 +402,8 @@ class Envelope:
         self.collisions: CollisionGuard | None = None
         """Keeps the arm off itself, off boxes and off other arms; None if nothing is checked."""
         self._tcp = TcpReference(smoother, kinematics, workspace)
+        self.pose_and_jacobian = self._tcp.pose_and_jacobian
+        """Returns pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick."""
 
     def open(self, session: Session) -> None:
         """Set the terms of a session."""
@@ -498,10 +500,6 @@ class Envelope:
         at, _ = self.pose_and_jacobian()
         faces = zip(at, tcp_velocity, self.workspace.lower, self.workspace.upper, strict=False)
         return [_FACE_GAIN * max(0.0, (high - x) if v > 0.0 else (x - low)) for x, v, low, high in faces]
-
-    def pose_and_jacobian(self) -> tuple[Pose7, NDArray[np.float64]]:
-        """Return pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick."""
-        return self._tcp.pose_and_jacobian()
 
     def stop_speed(self, dq: list[float], places: Sequence[Floats]) -> float:
         """Return the tcp's greatest speed, m/s, with joint speeds ``dq`` at any of these positions or in a stop."""

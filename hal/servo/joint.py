@@ -33,6 +33,8 @@ class ServoMotion(ABC):
 
     size: int
     """Number of values in a command of this kind."""
+    cartesian = False
+    """Whether each step needs the Jacobian at the set-point."""
 
     def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
         self.smoother = smoother

@@ -534,7 +534,7 @@ class Servo:
             compliance.begin()
         if not compliance.active:
             return
-        if compliance.hold_back() and motion is not None:
+        if compliance.hold_back(motion is not None and motion.cartesian) and motion is not None:
             motion.reanchored()
         if self._course.ending and self._smoother.at_rest():
             self._course.braking += self._smoother.dt

@@ -8,21 +8,23 @@ be at rest it is held there by positions again.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..commands import CommandRecord
 from ..driver import Reading, Setpoint
-from ..kinematics.arm import Pose7
 from ..specs import LimitsSpec
 from ..types import Limited
 from .envelope import Envelope
 from .joint import ServoMotion
 from .smoothing import JointSmoother
-from .torque_bounds import RATE, ArmInMotion, Inertia, TorqueBounds
+from .torque_bounds import RATE, ArmInMotion, Inertia, TcpInMotion, TorqueBounds, make_solver
 from .watchdog import SILENCE
+
+if TYPE_CHECKING:
+    from .controllers import ControllerLaw
 
 __all__ = [
     "BRAKE_LIMIT",
@@ -83,7 +85,10 @@ class TorqueMotion(ServoMotion):
         """Newest measured state of the arm; None while it is unknown."""
         self._tcp_at: Floats | None = None
         """Joint positions of :meth:`tcp`, rad."""
-        self._tcp: tuple[Pose7, Array] = ((0.0,) * 7, np.zeros((6, 0)))
+        self._tcp: TcpInMotion
+        self._solver = make_solver(self.size)
+        self.friction: Array | None = None
+        """What friction adds to the inertia that a controller's torques move in one tick (n, n), kg m2."""
         self._nothing = [0.0] * self.size
         self.tau = self._nothing
         """Torques that drive the arm now (n,), Nm."""
@@ -107,7 +112,7 @@ class TorqueMotion(ServoMotion):
     def open(self) -> None:
         """Open a session, at rest."""
         self.margin_share = 1.0
-        self._weighed_at = None  # a session of another kind needs the inertia in another form
+        self._weighed_at = None  # a session of another kind has other friction
         if self.bounds is not None:
             self.bounds.open_session(self.smoother.q)
 
@@ -126,11 +131,13 @@ class TorqueMotion(ServoMotion):
         self._still = self._still + dt if max(map(abs, reading.dq)) < _REST else 0.0
         self._update_arm()
 
-    def tcp(self) -> tuple[Pose7, Array]:
-        """Return the pose of the tcp where the arm was measured last, and its Jacobian (6, n) there."""
+    def tcp(self) -> TcpInMotion:
+        """Return the state of the tcp where the arm was measured last."""
         if self._tcp_at is not self.q:
             self._tcp_at = self.q
-            self._tcp = self.envelope.kinematics.fk_and_jacobian(self.q)
+            q, dq = np.array((self.q, self.dq))
+            pose, jacobian = self.envelope.kinematics.fk_and_jacobian(q)
+            self._tcp = TcpInMotion(pose, jacobian, jacobian[:3].dot(dq), q, dq)
         return self._tcp
 
     def _update_inertia(self) -> None:
@@ -140,7 +147,8 @@ class TorqueMotion(ServoMotion):
         assert self._mass_matrix is not None
         self._weighed_at = self.q
         try:
-            self._inertia = Inertia(self._mass_matrix(self.q), self.size, not self.by_controller)
+            friction = self.friction if self.by_controller else None
+            self._inertia = Inertia(self._mass_matrix(self.q), self.size, friction, self._solver)
         except ValueError:
             self._inertia = None
 
@@ -226,7 +234,7 @@ class TorqueMotion(ServoMotion):
                 self.tau, self._share = self.bounds.brake(before, arm, 0.0)
         self._begun = True
 
-    def drive(self, tau: Any, gain: Any, arm: ArmInMotion, velocity: Any) -> None:
+    def drive(self, law: ControllerLaw, tau: Array, arm: ArmInMotion, velocity: Array) -> None:
         """Move the torques by one tick towards those of a controller (see :meth:`TorqueBounds.shared`).
 
         The first set-point has none: it changes the mode.
@@ -234,7 +242,8 @@ class TorqueMotion(ServoMotion):
         self._braking = self._share = 0.0
         if self._begun:
             assert self.bounds is not None
-            self.tau = self.bounds.together(self.tau, self.bounds.shared(tau, gain, arm, velocity))
+            goal = self.bounds.shared(tau, law.gain, law.most_gain, arm, velocity)
+            self.tau = self.bounds.together(self.tau, goal)
         self._begun = True
 
     def brake(self) -> bool:

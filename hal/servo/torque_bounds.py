@@ -12,6 +12,7 @@ an obstacle or a push is not predicted; it shows in the measured speeds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from math import dist, hypot, isfinite, sqrt
 from operator import mul
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kinematics.arm import Pose7
 from ..specs import LimitsSpec
 from ..types import Limited
 from .envelope import UNLIMITED, Envelope
@@ -27,7 +29,9 @@ __all__ = [
     "RATE",
     "ArmInMotion",
     "Inertia",
+    "TcpInMotion",
     "TorqueBounds",
+    "make_solver",
 ]
 
 Array = NDArray[np.float64]
@@ -79,35 +83,50 @@ _RUNAWAY = 1.5
 model's."""
 
 
+def make_solver(n: int) -> Any:
+    """Return memory for the Cholesky factors of an inertia (n, n)."""
+    import eigenpy
+
+    return eigenpy.LLT(np.eye(n))
+
+
 class Inertia:
     """Joint-space inertia of an arm at one position.
 
     Args:
         mass_matrix: (n, n), kg m2.
         n: Number of joints.
-        inverted: Make :attr:`inverse` and :attr:`alone`; otherwise :attr:`solve`, which takes less time.
+        friction: What friction adds to the inertia that torques move (n, n), kg m2; None for nothing.
+        solver: Memory for :meth:`solve`, from :func:`make_solver`: the Inertia made before with it is then no longer
+            valid. None for its own.
 
     Raises:
         ValueError: It is not the inertia of an arm.
     """
 
-    def __init__(self, mass_matrix: Any, n: int, inverted: bool = True) -> None:
+    def __init__(self, mass_matrix: Any, n: int, friction: Array | None = None, solver: Any = None) -> None:
         self.mass: Array = np.array(mass_matrix, float)
-        sound = self.mass.shape == (n, n) and isfinite(np.vdot(self.mass, self.mass))
-        if not (sound and min(self.mass.diagonal().tolist()) > 0.0):
+        if not (self.mass.shape == (n, n) and isfinite(np.vdot(self.mass, self.mass))):
             raise ValueError(f"not the inertia of an arm with {n} joints: {self.mass.tolist()}")
-        if inverted:
-            self.inverse: Any = np.linalg.inv(self.mass)  # its LinAlgError is a ValueError
-            self.alone: list[float] = (1.0 / self.inverse.diagonal()).tolist()
-            """Inertia of each joint (n,) while the others are free, kg m2."""
-            return
-        import eigenpy
-
-        factors = eigenpy.LLT(self.mass)
-        if factors.info() != eigenpy.ComputationInfo.Success:
+        self.moved: Array = self.mass if friction is None else self.mass + friction
+        """What torques move: the mass matrix, and the friction."""
+        solver = make_solver(n) if solver is None else solver
+        solver.compute(self.moved)
+        if solver.info():  # 0: success
             raise ValueError(f"not positive definite, so not the inertia of an arm: {self.mass.tolist()}")
-        self.solve: Callable[[Array], Array] = factors.solve
+        self.solve: Callable[[Array], Array] = solver.solve
         """Return the accelerations, rad/s2, under torques (n,) or (n, m), Nm."""
+
+    @cached_property
+    def inverse(self) -> Array:
+        """Inverse (n, n), 1/(kg m2)."""
+        return self.solve(np.eye(len(self.mass)))
+
+    @cached_property
+    def alone(self) -> list[float]:
+        """Inertia of each joint (n,) while the others are free, kg m2."""
+        alone: list[float] = (1.0 / self.inverse.diagonal()).tolist()
+        return alone
 
     def added(self, tau: Floats, lag: float) -> list[float]:
         """Return what torques (n,) still add to the joint speeds (n,), rad/s, although they are removed from now on."""
@@ -133,6 +152,20 @@ class ArmInMotion(NamedTuple):
     dq: Floats
     """Joint speeds (n,), rad/s."""
     inertia: Inertia
+
+
+class TcpInMotion(NamedTuple):
+    """Measured state of an arm's tcp."""
+
+    pose: Pose7
+    jacobian: Array
+    """(6, n), along the base's axes."""
+    velocity: Array
+    """(3,), m/s."""
+    q: Array
+    """Joint positions (n,), rad."""
+    dq: Array
+    """Joint speeds (n,), rad/s."""
 
 
 class TorqueBounds:
@@ -213,13 +246,16 @@ class TorqueBounds:
         speed = sqrt(velocity.dot(velocity))
         return max(0.0, min(1.0, (_FED * most - speed) / ((_FED - _SPRINGS) * most)))
 
-    def shared(self, tau: Any, gain: Any, arm: ArmInMotion, velocity: Any) -> list[float]:
+    def shared(
+        self, tau: Array, gain: Callable[[], Array], most_gain: float, arm: ArmInMotion, velocity: Array
+    ) -> list[float]:
         """Return the torques (n,) to move towards, Nm: a controller's, with as much of the springs as keeps the speeds.
 
         Args:
             tau: Torques (2, n), Nm: those of all but its springs, which make the arm no faster than its set-point and
                 are applied in full; and those of its springs.
-            gain: Velocity (3,) of the tcp, m/s, that the springs may still add.
+            gain: Returns the velocity (3,) of the tcp, m/s, that the springs may still add.
+            most_gain: An upper bound of its length, m/s.
             arm: Measured state.
             velocity: Velocity (3,) of its tcp, m/s.
         """
@@ -231,13 +267,13 @@ class TorqueBounds:
             share = min(map(_share, before, more, [_COUPLED * v for v in self.velocity]))
             if share < 1.0:
                 envelope.limited |= Limited.SPEED
-        if self.tcp_speed < UNLIMITED:
-            tcp_share = _greatest_share(velocity, gain, _SPRINGS * self.tcp_speed)
+        cap = _SPRINGS * self.tcp_speed
+        if self.tcp_speed < UNLIMITED and not sqrt(velocity.dot(velocity)) + most_gain <= cap:
+            tcp_share = _greatest_share(velocity, gain(), cap)
             if tcp_share < 1.0:
                 envelope.limited |= Limited.TCP_SPEED
                 share = min(share, tcp_share)
-        wanted = tau[0] + share * tau[1]
-        total: list[float] = wanted.tolist()
+        total: list[float] = (tau[0] + (tau[1] if share == 1.0 else share * tau[1])).tolist()
         size = hypot(*total)
         if size <= self._weakest:
             return total
@@ -371,21 +407,19 @@ class TorqueBounds:
                 return Limited.COLLISION
         return None
 
-    def strays(self, arm: ArmInMotion, jacobian: Array) -> Limited | None:
+    def strays(self, arm: ArmInMotion, velocity: Array) -> Limited | None:
         """Return the limit that an arm exceeds whose set-point keeps all of them; None if it keeps all.
 
         That are its own joint speeds, half as much again as the session's tcp speed, and its ranges.
 
         Args:
             arm: Measured state.
-            jacobian: Jacobian (6, n) of the tcp there.
+            velocity: Velocity (3,) of its tcp, m/s.
         """
-        speed = hypot(*arm.dq)
-        limits, fastest = self._limits.velocity, _RUNAWAY * self.tcp_speed
-        if speed > self._slowest and any(abs(v) > most for v, most in zip(arm.dq, limits, strict=True)):
+        limits = self._limits.velocity
+        if hypot(*arm.dq) > self._slowest and any(abs(v) > most for v, most in zip(arm.dq, limits, strict=True)):
             return Limited.SPEED
-        slow = speed * self._reach_length <= fastest
-        if not slow and hypot(*jacobian[:3].dot(arm.dq).tolist()) > fastest:
+        if sqrt(velocity.dot(velocity)) > _RUNAWAY * self.tcp_speed:
             return Limited.TCP_SPEED
         if dist(arm.q, self._middle) > self._radius:
             for x, (low, high) in zip(arm.q, self._ranges, strict=True):

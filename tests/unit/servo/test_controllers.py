@@ -29,7 +29,7 @@ from hal.servo.controllers import (
     resolve,
     with_gains,
 )
-from hal.servo.torque_bounds import Inertia
+from hal.servo.torque_bounds import ArmInMotion, Inertia, TcpInMotion
 from hal.types import ControlMode, Limited, RobotStatus, Trip
 
 Array = NDArray[np.float64]
@@ -57,13 +57,16 @@ class Applied:
         mass: Array = MASS,
     ) -> Array:
         """Return all torques (n,), Nm; the arm moves at ``-lag`` while its set-point rests."""
-        setpoint = (list(HOME + away), [0.0] * N, list(acceleration))
-        dq = [-v for v in lag]
-        pose = KINEMATICS.fk(HOME)
-        rows = self.law.torques(
-            HOME.tolist(), dq, setpoint, Inertia(mass, N, inverted=False), JACOBIAN, pose, list(error)
-        )
+        setpoint = (HOME + away, np.zeros(N), np.array(acceleration))
+        rows = self.law.torques(*in_motion(HOME, -np.array(lag), mass), setpoint, list(error))
         return np.asarray(rows.sum(axis=0), np.float64)
+
+
+def in_motion(q: Array, dq: Array, mass: Array) -> tuple[ArmInMotion, TcpInMotion]:
+    """Return the measured state of an arm, and of its tcp."""
+    pose, jacobian = KINEMATICS.fk_and_jacobian(q)
+    arm = ArmInMotion(q.tolist(), dq.tolist(), Inertia(mass, N))
+    return arm, TcpInMotion(pose, jacobian, jacobian[:3] @ dq, q, dq)
 
 
 def test_joint_springs_pull_with_their_stiffness() -> None:
@@ -116,12 +119,12 @@ def test_gains_along_the_tcp_turn_with_it() -> None:
     along, across = (rotate(pose[3:], axis) for axis in ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)))
     for direction, stiffness in ((along, 1000.0), (across, 100.0)):
         error = [0.01 * x for x in direction] + [0.0] * 3
-        still = (q.tolist(), list(NOTHING), list(NOTHING))
-        inertia = Inertia(DYNAMICS.mass_matrix(q), N, inverted=False)
-        tau = law.torques(q.tolist(), list(NOTHING), still, inertia, jacobian, pose, error).sum(axis=0)
+        arm, tcp = in_motion(q, np.zeros(N), DYNAMICS.mass_matrix(q))
+        tau = law.torques(arm, tcp, (q, np.zeros(N), np.zeros(N)), error).sum(axis=0)
         assert tau == pytest.approx(jacobian[:3].T @ (stiffness * np.array(error[:3])), abs=1e-9)
-        ease = jacobian[:3] @ inertia.solve(tau)
-        assert law.gain @ ease > 0.9 * np.linalg.norm(law.gain) * np.linalg.norm(ease) > 0.0
+        ease, gain = jacobian[:3] @ arm.inertia.solve(tau), law.gain()
+        assert gain @ ease > 0.9 * np.linalg.norm(gain) * np.linalg.norm(ease) > 0.0
+        assert np.linalg.norm(gain) <= law.most_gain < np.inf
 
 
 def test_what_is_too_light_for_the_rate_is_softened() -> None:
@@ -201,7 +204,7 @@ def test_a_light_joint_in_the_null_space_has_a_softer_posture() -> None:
 def test_an_inertia_that_no_arm_has_is_refused() -> None:
     for wrong in (-np.eye(N), np.full((N, N), math.nan), np.eye(N) - 2.0 * np.ones((N, N)) / N, np.eye(6)):
         with pytest.raises(ValueError, match="inertia"):
-            Inertia(wrong, N, inverted=False)
+            Inertia(wrong, N)
 
 
 CONTROLLERS = pytest.mark.parametrize("controller", [OperationalSpace(), JointImpedance()], ids=["task", "joints"])

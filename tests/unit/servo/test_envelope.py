@@ -297,6 +297,10 @@ class Counted(Kinematics):
         self.computed += 1
         return super().jacobian(q)
 
+    def fk_and_jacobian(self, q: Any) -> Any:
+        self.computed += 1
+        return super().fk_and_jacobian(q)
+
 
 def counted_bench(tcp_speed: float) -> tuple[Bench, Counted]:
     spec = replace(panda(), workspace=WorkspaceSpec((0.1, -0.8, 0.0), (0.9, 0.8, 1.2)))

@@ -191,7 +191,7 @@ def test_the_torques_of_a_controller_change_in_proportion() -> None:
 
 def test_torques_of_a_controller_that_are_no_numbers_are_none() -> None:
     made, envelope = bounds()
-    arm = ArmInMotion(HOME, STILL, Inertia(np.eye(N), N, inverted=False))
+    arm = ArmInMotion(HOME, STILL, Inertia(np.eye(N), N))
     tau = np.array([[math.nan, *STILL[1:]], STILL])
-    assert made.shared(tau, np.zeros(3), arm, np.zeros(3)) == STILL
+    assert made.shared(tau, lambda: np.zeros(3), 0.0, arm, np.zeros(3)) == STILL
     assert envelope.limited
