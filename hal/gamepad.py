@@ -240,8 +240,11 @@ class Gamepad:
                 self._gate.shut()
                 buttons = frozenset()
             live = reading.connected and self._gate.open
-            values = {} if not live else {k: v for k, v in reading.axes.items() if k not in self._gate.ignored}
-            axes = {name: self._shape_axis(name, values.get(name, 0.0)) for name in AXES}
+            values, ignored = reading.axes if live else {}, self._gate.ignored
+            axes = {
+                name: self._shape_axis(name, values[name]) if name in values and name not in ignored else 0.0
+                for name in AXES
+            }
             for held in self._held.values():
                 held.update(reading, gate_open=live)
             last = self._state

@@ -214,8 +214,8 @@ def pad_driver(pad_input: PadInput) -> str:
 
 def is_engine(name: str | None) -> bool:
     """Return whether a name under ``drivers`` stands for the rig's engine: ``simulation``, or the name of an engine."""
-    if name is None or name in BUILT_IN:
-        return name in ENGINES
+    if name is None:
+        return False
     try:
         return name == SIMULATION or driver(name).world is not None
     except (DeviceNotFound, DriverMissing):
@@ -226,7 +226,7 @@ def explain_engine(choice: str) -> str | None:
     """Return why ``choice`` is neither ``auto`` nor the name of an engine; None if it is."""
     if choice == "auto" or (choice != SIMULATION and is_engine(choice)):
         return None
-    there = ("auto", *ENGINES)
+    there = ("auto", *ENGINES, *(name for name in _entry_points() if is_engine(name)))
     return f"{choice!r} is no engine{_suggest(choice, there)}: {', '.join(there)}, or a driver with a world"
 
 

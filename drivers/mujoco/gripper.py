@@ -19,18 +19,18 @@ class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
 
     WORLD = MujocoWorld
 
-    def _find(self) -> None:
-        self._at = self._world.dofs(self._body, self.spec.joints)
-        joints, followers = self.spec.joints, self._body.followers
-        self._followers = self._world.dofs(self._body, [one.joint for one in followers]) if followers else None
+    def find_device(self) -> None:
+        self._at = self.scene.dofs(self.body, self.spec.joints)
+        joints, followers = self.spec.joints, self.body.followers
+        self._followers = self.scene.dofs(self.body, [one.joint for one in followers]) if followers else None
         self._follow = [(joints.index(one.of), one.multiplier, one.offset) for one in followers]
 
-    def _handle(self, active: bool) -> None:
-        self._world.handle(self._body.name, active)
+    def handle_fingers(self, active: bool) -> None:
+        self.scene.handle(self.body.name, active)
 
-    def _drive(self, speed: float) -> None:
-        motors, at, travel = self._world.motors, self._at, self._travel
-        width = self._width()[0]
+    def drive_fingers(self, speed: float) -> None:
+        motors, at, travel = self.scene.motors, self._at, self.travel
+        width = self.read_width()[0]
         targets, speeds = travel.positions(self._target), travel.speeds(speed, width)
         motors.target[at], motors.feed[at] = targets, 0.0
         motors.efforts[at], motors.speeds[at] = travel.efforts(self._force, width), speeds
@@ -39,6 +39,6 @@ class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
             motors.speeds[self._followers] = [abs(ratio) * speeds[of] for of, ratio, _ in self._follow]
         motors.limit()
 
-    def _width(self) -> tuple[float, float, float, float]:
-        world, at = self._world, self._at
-        return self._travel.reading(world.q[at].tolist(), world.dq[at].tolist(), world.motors.applied[at].tolist())
+    def read_width(self) -> tuple[float, float, float, float]:
+        world, at = self.scene, self._at
+        return self.travel.reading(world.q[at].tolist(), world.dq[at].tolist(), world.motors.applied[at].tolist())

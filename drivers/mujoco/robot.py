@@ -19,37 +19,37 @@ class MujocoRobot(SimulatedRobot[MujocoWorld]):
 
     WORLD = MujocoWorld
 
-    def _find(self) -> None:
-        self._body = self._world.body(self.spec.name)
-        self._at = self._world.dofs(self._body, self.spec.joints)
+    def find_device(self) -> None:
+        self.body = self.scene.body(self.spec.name)
+        self._at = self.scene.dofs(self.body, self.spec.joints)
         self._inertia: Any = None
 
-    def _state(self) -> tuple[Floats, Floats, Floats]:
-        world, at = self._world, self._at
+    def read_state(self) -> tuple[Floats, Floats, Floats]:
+        world, at = self.scene, self._at
         return world.q[at].tolist(), world.dq[at].tolist(), world.motors.applied[at].tolist()
 
-    def _follow(self, q: Floats, dq: Floats) -> None:
-        motors, at = self._world.motors, self._at
+    def follow_setpoint(self, q: Floats, dq: Floats) -> None:
+        motors, at = self.scene.motors, self._at
         motors.target[at] = q
         motors.feed[at] = dq
 
-    def _hold_at(self, q: Floats) -> None:
-        motors, at = self._world.motors, self._at
+    def hold_at(self, q: Floats) -> None:
+        motors, at = self.scene.motors, self._at
         if motors.drive_by_motors(self.spec.name):
             motors.rest(at, q)
         motors.target[at], motors.feed[at] = q, 0.0
 
-    def _take_over(self) -> None:
+    def release_motors(self) -> None:
         """Do nothing: the first torques switch the motors off."""
 
-    def _apply(self, tau: Floats) -> None:
-        self._world.motors.drive_by_torques(self.spec.name, self._at, tau)
+    def apply_torques(self, tau: Floats) -> None:
+        self.scene.motors.drive_by_torques(self.spec.name, self._at, tau)
 
     def _restore(self, state: dict[str, Any]) -> None:
         super()._restore(state)
         if self._tau is not None:
-            self._apply(self._tau)
+            self.apply_torques(self._tau)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
         """Return the joint-space inertia of the simulated arm (n, n) at ``q``, kg m2."""
-        return self._world.mass_matrix(self._at, q)
+        return self.scene.mass_matrix(self._at, q)

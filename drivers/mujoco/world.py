@@ -84,8 +84,8 @@ class MujocoWorld(SimulatedWorld[Body]):
         option.enableflags = int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
         self.motors = Motors(0, self.dt, option.timestep)
         try:
-            self._load((*spec.bodies, *spec.robots))
-            self._check_overlaps()
+            self.load_bodies((*spec.bodies, *spec.robots))
+            self.check_overlaps()
         except BaseException:
             self.close()
             raise
@@ -94,17 +94,17 @@ class MujocoWorld(SimulatedWorld[Body]):
         if self.fault is not None:
             self.steps += 1
             return
-        for prepare in self._before_steps.values():
+        for prepare in self.preparations.values():
             prepare()
         if self._following:
             self._hold_mirrors()
         motors, model, data = self.motors, self.model, self.data
         if not self.steps % SOUND_EVERY:
             self._sound[:] = self._qpos
-        if self._forces:  # before the step, so that they wake what sleeps
+        if self.forces:  # before the step, so that they wake what sleeps
             self._kinematics()
-            for force in self._forces:
-                self._push(force)
+            for force in self.forces:
+                self.push_link(force)
         for _ in range(self.substeps):
             self._step1(model, data)
             motors.drive()
@@ -113,9 +113,9 @@ class MujocoWorld(SimulatedWorld[Body]):
                 motors.target += motors.feed * motors.h  # as far as it moves in this part of the step
         if self.substeps > 1:
             motors.target -= motors.feed * self.dt
-        if self._forces:
+        if self.forces:
             data.xfrc_applied[:] = 0.0
-            self._spend_forces()
+            self.spend_forces()
         self.steps += 1
         self._placed = False
         self._touched = True
@@ -166,7 +166,7 @@ class MujocoWorld(SimulatedWorld[Body]):
 
     # --- loading -----------------------------------------------------------------------------------------------------
 
-    def _place(self, spec: BodySpec | RobotSpec) -> Body:
+    def load_body(self, spec: BodySpec | RobotSpec) -> Body:
         if isinstance(spec, RobotSpec):
             plan = plan_robot(spec, mirrored=spec.driver != self.spec.driver)
         else:
@@ -175,13 +175,13 @@ class MujocoWorld(SimulatedWorld[Body]):
         self.warnings += plan.warnings
         return plan.body
 
-    def _take_out(self, body: Body) -> None:
+    def unload_body(self, body: Body) -> None:
         take_out(self._spec, self._plans.pop(body.name))
 
-    def _arrange(self, added: Sequence[Body]) -> None:
+    def arrange_bodies(self, added: Sequence[Body]) -> None:
         for body in sorted(added, key=lambda body: not body.is_robot):
             build(self._spec, self._plans[body.name])
-        for part, whole, ignored in self._parts(added):
+        for part, whole, ignored in self.list_parts(added):
             for k, m in product(part.links.values(), ignored):
                 first, second = part.link_path(k), whole.link_path(m)
                 self._spec.add_exclude(bodyname1=first, bodyname2=second, name=f"{first}|{second}")
@@ -226,8 +226,8 @@ class MujocoWorld(SimulatedWorld[Body]):
             for body in robots
             if isinstance(body.spec, RobotSpec) and body.spec.gripper is not None
         }
-        self._mirrored = [body for body in robots if self._is_mirrored(body)]
-        self._attached = self._attachments()
+        self._mirrored = [body for body in robots if self.is_mirrored(body)]
+        self._attached = self.list_attachments()
         self._step1, self._step2 = mujoco.mj_step1, mujoco.mj_step2
         self._speeds, self._sound = data.qvel, data.qpos.copy()
         self._qpos = data.qpos
@@ -279,14 +279,14 @@ class MujocoWorld(SimulatedWorld[Body]):
         root, model = body.ids[0], self.model
         model.body_pos[root], model.body_quat[root] = body.place[0], wxyz(body.place[1])
 
-    def _follow_attached(self) -> None:
+    def place_attached(self) -> None:
         self._placed = False
 
-    def _read_pose(self, body: Body, link: int) -> Transform:
+    def read_pose(self, body: Body, link: int) -> Transform:
         self._kinematics()
         return self._pose_of(body.ids[link])
 
-    def _read_velocity(self, body: Body) -> tuple[Sequence[float], Sequence[float]]:
+    def read_velocity(self, body: Body) -> tuple[Sequence[float], Sequence[float]]:
         if body.free is None:
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         at, along = body.free
@@ -296,7 +296,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         lever = rotate((x, y, z, w), self.model.body_ipos[body.ids[0]].tolist())
         return [v + d for v, d in zip(speeds[:3], _cross(angular, lever), strict=True)], list(angular)
 
-    def _set_velocity(self, body: Body, linear: Sequence[float], angular: Sequence[float]) -> None:
+    def write_velocity(self, body: Body, linear: Sequence[float], angular: Sequence[float]) -> None:
         assert body.free is not None
         at, along = body.free
         w, x, y, z = self.data.qpos[at + 3 : at + 7].tolist()
@@ -304,7 +304,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         own = [v - d for v, d in zip(linear, _cross(angular, lever), strict=True)]
         self.data.qvel[along : along + 6] = [*own, *rotate((-x, -y, -z, w), angular)]
 
-    def _move_base(self, body: Body, pose: Transform) -> None:
+    def move_base(self, body: Body, pose: Transform) -> None:
         self._placed = False
         if body.free is None:
             body.place = pose
@@ -317,7 +317,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         self.data.qpos[at : at + 7] = [*pose[0], *wxyz(pose[1])]
         self.data.qvel[along : along + 6] = 0.0
 
-    def _move_joints(self, body: Body, positions: Mapping[int, float]) -> None:
+    def move_joints(self, body: Body, positions: Mapping[int, float]) -> None:
         self._placed = False
         for joint, position in positions.items():
             place = body.qvel[joint]
@@ -326,34 +326,34 @@ class MujocoWorld(SimulatedWorld[Body]):
                 self.motors.rest(place, position)
         if body.is_robot:
             self.motors.drive_by_motors(body.name)
-            if not self._is_mirrored(body):
+            if not self.is_mirrored(body):
                 self._set_limits(body)
                 self.motors.limit()
 
-    def _read_joints(self, body: Body) -> Sequence[float]:
+    def read_joints(self, body: Body) -> Sequence[float]:
         return [float(self.data.qpos[body.qpos[joint]]) for joint in body.movable]
 
-    def _read_dynamics(self, body: Body, link: int) -> dict[str, Any]:
+    def read_dynamics(self, body: Body, link: int) -> dict[str, Any]:
         return read_dynamics(self.model, body, link)
 
-    def _write_dynamics(self, body: Body, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+    def write_dynamics(self, body: Body, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
         write_dynamics(self._spec, body, link, values)
         try:
-            self._arrange(())
+            self.arrange_bodies(())
         except ConfigError as error:
             write_dynamics(self._spec, body, link, {name: before[name] for name in values})
-            self._arrange(())
+            self.arrange_bodies(())
             message = f"{body.name!r} cannot have these dynamics: {error.problems[0].message}"
             raise CommandError(message, code="bad_dynamics") from None
 
-    def _forget(self, bodies: Sequence[Body]) -> None:
+    def forget_contacts(self, bodies: Sequence[Body]) -> None:
         self.sleep.wake()
         if len(bodies) == len(self.bodies):
             self.fault, self._touched = None, False
         for body in bodies:
             self.data.qacc_warmstart[_places(body)[1]] = 0.0
 
-    def _save(self) -> dict[str, Any]:
+    def save_engine(self) -> dict[str, Any]:
         mujoco, motors = self.mujoco, self.motors
         kind = mujoco.mjtState.mjSTATE_INTEGRATION
         values = np.empty(mujoco.mj_stateSize(self.model, kind))
@@ -367,7 +367,7 @@ class MujocoWorld(SimulatedWorld[Body]):
             },
         }
 
-    def _restore(self, state: Any) -> None:
+    def restore_engine(self, state: Any) -> None:
         mujoco, motors = self.mujoco, self.motors
         kind = mujoco.mjtState.mjSTATE_INTEGRATION
         values, parts = np.array(state["integration"], float), [np.array(part, float) for part in state["motors"]]
@@ -398,7 +398,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         self.fault, self._placed, self._touched = None, False, False
         self._lay_out()
 
-    def _push(self, force: AppliedForce[Body]) -> None:
+    def push_link(self, force: AppliedForce[Body]) -> None:
         number, data = force.body.ids[force.link], self.data
         acting = data.xfrc_applied[number]  # at the centre of mass
         acting[:3] += force.force
@@ -407,22 +407,22 @@ class MujocoWorld(SimulatedWorld[Body]):
             lever = data.xpos[number] + rotate((*xyz, w), force.point) - data.xipos[number]
             acting[3:] += np.cross(lever, force.force)
 
-    def _set_gravity(self, gravity: Sequence[float]) -> None:
+    def write_gravity(self, gravity: Sequence[float]) -> None:
         self._spec.option.gravity = gravity
         self.model.opt.gravity[:] = gravity
         self.sleep.wake()
 
-    def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
+    def cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
         self._kinematics()
         return cast_ray(self.mujoco, self.model, self.data, self.bodies.values(), start, end)
 
-    def _distance(self, a: Body, links_a: Sequence[int], b: Body, links_b: Sequence[int]) -> float | None:
+    def measure_distance(self, a: Body, links_a: Sequence[int], b: Body, links_b: Sequence[int]) -> float | None:
         self._kinematics()
         own = [shape for link in links_a for shape in a.shapes[link]]
         others = [shape for link in links_b for shape in b.shapes[link]]
         return distance(self.mujoco, self.model, self.data, own, others)
 
-    def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
+    def find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         if not self._touched:
             return []
         mujoco, model, data, bodies = self.mujoco, self.model, self.data, self.bodies.values()
@@ -436,17 +436,17 @@ class MujocoWorld(SimulatedWorld[Body]):
             found += find_contacts(mujoco, model, still, bodies, a, b, only=sleepers)
         return found
 
-    def _deepest_overlap(self, a: Body, b: Body) -> tuple[float, str, str]:
+    def find_overlap(self, a: Body, b: Body) -> tuple[float, str, str]:
         self._kinematics()
         return deepest_overlap(self.mujoco, self.model, self.data, a, b)
 
-    def _bounding_box(self, body: Body) -> tuple[list[float], list[float]]:
+    def measure_box(self, body: Body) -> tuple[list[float], list[float]]:
         self._kinematics()
         return bounding_box(self.mujoco, self.model, self.data, body)
 
     # --- mirrors of real arms ----------------------------------------------------------------------------------------
 
-    def _follow(self, body: Body, q: list[float], dq: list[float], width: float | None) -> None:
+    def place_mirror(self, body: Body, q: list[float], dq: list[float], width: float | None) -> None:
         assert isinstance(body.spec, RobotSpec)
         motors, data, at = self.motors, self.data, self.dofs(body, body.spec.joints)
         data.qpos[at], data.qvel[at] = q, dq

@@ -20,15 +20,15 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
 
     WORLD = PyBulletWorld
 
-    def _find(self) -> None:
-        self._joints = [self._body.joints[name] for name in self.spec.joints]
-        self._read = self._world.client.getJointStates
+    def find_device(self) -> None:
+        self._joints = [self.body.joints[name] for name in self.spec.joints]
+        self._read = self.scene.client.getJointStates
 
-    def _handle(self, active: bool) -> None:
-        self._world.handle(self._body.name, active)
+    def handle_fingers(self, active: bool) -> None:
+        self.scene.handle(self.body.name, active)
 
-    def _drive(self, speed: float) -> None:
-        client, travel, width = self._world.client, self._travel, self._width()[0]
+    def drive_fingers(self, speed: float) -> None:
+        client, travel, width = self.scene.client, self.travel, self.read_width()[0]
         drives = zip(
             self._joints,
             travel.positions(self._target),
@@ -38,23 +38,23 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
         )
         for joint, position, effort, fastest in drives:
             client.setJointMotorControl2(
-                self._body.id,
+                self.body.id,
                 joint,
                 client.POSITION_CONTROL,
                 targetPosition=position,
                 force=effort,
-                positionGain=position_gain(self._world.dt),
+                positionGain=position_gain(self.scene.dt),
                 velocityGain=1.0,
                 maxVelocity=fastest,
             )
 
-    def _resume(self) -> None:
+    def resume_motors(self) -> None:
         if self._driven is not None:
-            self._drive(self._driven)
+            self.drive_fingers(self._driven)
         else:
-            targets = dict(zip(self._joints, self._travel.positions(self._target), strict=True))
-            hold(self._world.client, self._body, targets, self._world.dt)
+            targets = dict(zip(self._joints, self.travel.positions(self._target), strict=True))
+            hold(self.scene.client, self.body, targets, self.scene.dt)
 
-    def _width(self) -> tuple[float, float, float, float]:
-        positions, speeds, _, efforts = zip(*self._read(self._body.id, self._joints), strict=True)
-        return self._travel.reading(positions, speeds, efforts)
+    def read_width(self) -> tuple[float, float, float, float]:
+        positions, speeds, _, efforts = zip(*self._read(self.body.id, self._joints), strict=True)
+        return self.travel.reading(positions, speeds, efforts)

@@ -31,22 +31,22 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
 
     WORLD = PyBulletWorld
 
-    def _find(self) -> None:
-        world = self._world
-        self._body = world.body(self.spec.name)
-        self._joints = [self._body.joints[name] for name in self.spec.joints]
-        self._efforts = [self._body.efforts[joint] for joint in self._joints]
+    def find_device(self) -> None:
+        world = self.scene
+        self.body = world.body(self.spec.name)
+        self._joints = [self.body.joints[name] for name in self.spec.joints]
+        self._efforts = [self.body.efforts[joint] for joint in self._joints]
         self._position_gains = [position_gain(world.dt)] * len(self._joints)
         self._velocity_gains = [1.0] * len(self._joints)
         self._read = world.client.getJointStates
         self._write = world.client.setJointMotorControlArray
         self._mode = world.client.POSITION_CONTROL
-        self._torques = JointTorques(world.client, self._body, self._joints, world.dt)
+        self._torques = JointTorques(world.client, self.body, self._joints, world.dt)
         self._t_applied = 0.0
         """The step to which torques were applied last, in simulated s."""
 
-    def _state(self) -> tuple[Floats, Floats, Floats]:
-        q, dq, _, tau = zip(*self._read(self._body.id, self._joints), strict=True)
+    def read_state(self) -> tuple[Floats, Floats, Floats]:
+        q, dq, _, tau = zip(*self._read(self.body.id, self._joints), strict=True)
         if not (hypot(*dq) < FASTEST and isfinite(sum(tau))):
             fast = FASTEST <= hypot(*dq) < inf
             return self._unstable(f"joints are faster than {FASTEST:g} rad/s" if fast else "a number is not finite")
@@ -54,15 +54,15 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
 
     def _unstable(self, reason: str) -> tuple[Floats, Floats, Floats]:
         """Report that the simulation has become unstable; return the arm's last sound position, at rest."""
-        self._world.note_unstable(reason)
-        home = [self._body.home[joint] for joint in self._joints]
+        self.scene.note_unstable(reason)
+        home = [self.body.home[joint] for joint in self._joints]
         nothing = [0.0] * len(home)
         return home if self._frozen is None else self._frozen.q, nothing, nothing
 
-    def _follow(self, q: Floats, dq: Floats) -> None:
-        dt = self._world.dt
+    def follow_setpoint(self, q: Floats, dq: Floats) -> None:
+        dt = self.scene.dt
         self._write(
-            self._body.id,
+            self.body.id,
             self._joints,
             self._mode,
             [a - b * dt for a, b in zip(q, dq, strict=True)],  # and their velocities, forces and gains, by position:
@@ -74,20 +74,20 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
 
     def _end_torques(self) -> None:
         """Withdraw torques that the coming step would have; the joints are damped again."""
-        if self._tau is not None and self._t_applied == self._world.t:
+        if self._tau is not None and self._t_applied == self.scene.t:
             self._torques.withdraw()
         self._torques.end()
 
-    def _hold_at(self, q: Floats) -> None:
+    def hold_at(self, q: Floats) -> None:
         self._end_torques()
-        hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)
+        hold(self.scene.client, self.body, dict(zip(self._joints, q, strict=True)), self.scene.dt)
 
-    def _take_over(self) -> None:
+    def release_motors(self) -> None:
         self._torques.take_over([0.0] * len(self._joints) if self._dq is None else self._dq)
-        self._t_applied = self._world.t
+        self._t_applied = self.scene.t
 
-    def _apply(self, tau: Floats) -> None:
-        t = self._world.t
+    def apply_torques(self, tau: Floats) -> None:
+        t = self.scene.t
         if t != self._t_applied:
             self._torques.next_step()
             self._t_applied = t
@@ -101,17 +101,17 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
         return super()._save() | {"torques": self._torques.save()}
 
     def _restore(self, state: dict[str, Any]) -> None:
-        if self._t_applied == self._world.t:
+        if self._t_applied == self.scene.t:
             self._torques.withdraw()
         super()._restore(state)
         q, dq = self._q, self._dq
-        self._hold_at(q if q is not None else [self._body.home[joint] for joint in self._joints])
+        self.hold_at(q if q is not None else [self.body.home[joint] for joint in self._joints])
         if self._tau is not None:
             self._torques.switch_off()
             self._torques.restore(state["torques"])
-            self._t_applied = self._world.t
+            self._t_applied = self.scene.t
         elif q is not None and dq is not None:
-            self._follow(q, dq)
+            self.follow_setpoint(q, dq)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
         """Return the joint-space inertia of the simulated arm (n, n) at ``q``, kg m2."""

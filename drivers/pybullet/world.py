@@ -108,9 +108,9 @@ class PyBulletWorld(SimulatedWorld[Body]):
             self.client.setGravity(*spec.gravity)
             self.client.setPhysicsEngineParameter(**SOLVER)
             self._set_solution()
-            self._load((*spec.bodies, *spec.robots))
+            self.load_bodies((*spec.bodies, *spec.robots))
             if not mirror:
-                self._check_overlaps()
+                self.check_overlaps()
                 if spec.physics_hz < LEAST_HZ:
                     self.warnings.append(
                         f"physics_hz is {spec.physics_hz:g}: below {LEAST_HZ:g}, PyBullet lets objects sink into each "
@@ -133,16 +133,16 @@ class PyBulletWorld(SimulatedWorld[Body]):
         if self.fault is not None:
             self.steps += 1
             return
-        for prepare in self._before_steps.values():
+        for prepare in self.preparations.values():
             prepare()
         for arm in self._mirrored.values():
             arm.prepare_step()
         for joints in self._damped:
             joints.prepare_step()
-        if self._forces:
-            for force in self._forces:
-                self._push(force)
-            self._spend_forces()
+        if self.forces:
+            for force in self.forces:
+                self.push_link(force)
+            self.spend_forces()
         self._step()
         self._attached.follow()
         self.steps += 1
@@ -201,16 +201,16 @@ class PyBulletWorld(SimulatedWorld[Body]):
         kind = "mirror" if mirrors else "fine" if self._handling else "coarse"
         self.client.setPhysicsEngineParameter(**SOLUTION[kind])
 
-    def _place(self, spec: BodySpec | RobotSpec) -> Body:
+    def load_body(self, spec: BodySpec | RobotSpec) -> Body:
         load = load_robot if isinstance(spec, RobotSpec) else load_object
         body, warnings = load(self.client, spec, self._drawn)  # type: ignore[arg-type]  # of that kind
         self.warnings += warnings
         return body
 
-    def _arrange(self, added: Sequence[Body]) -> None:
-        self._attached = AttachedObjects(self.client, self._attachments())
+    def arrange_bodies(self, added: Sequence[Body]) -> None:
+        self._attached = AttachedObjects(self.client, self.list_attachments())
         self._attached.leave_physics(added)
-        for part, whole, ignored in self._parts(added):
+        for part, whole, ignored in self.list_parts(added):
             for link, other in product(part.links.values(), ignored):
                 self.client.setCollisionFilterPair(part.id, whole.id, link, other, 0)
         self._damped = [PassiveJoints(self.client, body) for body in self.bodies.values() if body.damped]
@@ -220,59 +220,59 @@ class PyBulletWorld(SimulatedWorld[Body]):
         """Read the fixed bases again, after bodies were added, removed or placed."""
         self._layout = SnapshotLayout(self.client, self.bodies.values())
 
-    def _start(self, added: Sequence[Body]) -> None:
+    def start_bodies(self, added: Sequence[Body]) -> None:
         for body in added:
-            if self._is_mirrored(body):
+            if self.is_mirrored(body):
                 self._mirrored[body.name] = MirroredArm(self.client, body, self.dt)
 
-    def _take_out(self, body: Body) -> None:
+    def unload_body(self, body: Body) -> None:
         self.client.removeBody(body.id)
 
-    def _follow_attached(self) -> None:
+    def place_attached(self) -> None:
         self._attached.follow()
 
-    def _follow(self, body: Body, q: list[float], dq: list[float], width: float | None) -> None:
+    def place_mirror(self, body: Body, q: list[float], dq: list[float], width: float | None) -> None:
         self._mirrored[body.name].follow(q, dq, width)
 
-    def _deepest_overlap(self, a: Body, b: Body) -> tuple[float, str, str]:
+    def find_overlap(self, a: Body, b: Body) -> tuple[float, str, str]:
         return deepest_overlap(self.client, a, b)
 
-    def _read_pose(self, body: Body, link: int) -> Transform:
+    def read_pose(self, body: Body, link: int) -> Transform:
         if link == -1:
             return body.base_pose(self.client)
         state = self.client.getLinkState(body.id, link, computeForwardKinematics=True)
         return state[4], state[5]
 
-    def _read_velocity(self, body: Body) -> tuple[Sequence[float], Sequence[float]]:
+    def read_velocity(self, body: Body) -> tuple[Sequence[float], Sequence[float]]:
         linear, angular = self.client.getBaseVelocity(body.id)
         return linear, angular
 
-    def _set_velocity(self, body: Body, linear: Sequence[float], angular: Sequence[float]) -> None:
+    def write_velocity(self, body: Body, linear: Sequence[float], angular: Sequence[float]) -> None:
         self.client.resetBaseVelocity(body.id, linear, angular)
 
-    def _move_base(self, body: Body, pose: Transform) -> None:
+    def move_base(self, body: Body, pose: Transform) -> None:
         body.set_base_pose(self.client, pose)
         if body.floating:
             self.client.resetBaseVelocity(body.id, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         else:
             self._read_layout()
 
-    def _move_joints(self, body: Body, positions: Mapping[int, float]) -> None:
+    def move_joints(self, body: Body, positions: Mapping[int, float]) -> None:
         for joint, position in positions.items():
             self.client.resetJointState(body.id, joint, position, 0.0)
         if body.is_robot:
             hold(self.client, body, positions, self.dt)
 
-    def _read_joints(self, body: Body) -> Sequence[float]:
+    def read_joints(self, body: Body) -> Sequence[float]:
         return [state[0] for state in self.client.getJointStates(body.id, body.movable)] if body.movable else []
 
-    def _read_dynamics(self, body: Body, link: int) -> dict[str, Any]:
+    def read_dynamics(self, body: Body, link: int) -> dict[str, Any]:
         return read_dynamics(self.client, body, link)
 
-    def _write_dynamics(self, body: Body, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+    def write_dynamics(self, body: Body, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
         write_dynamics(self.client, body, link, values, before, self.dt)
 
-    def _forget(self, bodies: Sequence[Body]) -> None:
+    def forget_contacts(self, bodies: Sequence[Body]) -> None:
         if len(bodies) == len(self.bodies) and self.fault is not None:
             self._reload()
             self.fault = None
@@ -287,7 +287,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
         for body in reversed(bodies):
             client.removeBody(body.id)
         for body in bodies:
-            new = self._place(body.spec)
+            new = self.load_body(body.spec)
             body.id, body.gears, body.hardened, body.fingers = new.id, new.gears, new.hardened, new.fingers
             body.damping = new.damping
             body.handling, body.edits, body.reloads = True, body.edits + 1, body.reloads + 1
@@ -298,14 +298,14 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self.warnings = said
         self._handling = {robot.name for robot in self.spec.robots if robot.gripper is not None}
         self._set_solution()
-        self._arrange(bodies)
+        self.arrange_bodies(bodies)
         for body in bodies:
-            self._move_base(body, body.base)
-            self._move_joints(body, body.home)
-        self._start(bodies)
-        self._follow_attached()
+            self.move_base(body, body.base)
+            self.move_joints(body, body.home)
+        self.start_bodies(bodies)
+        self.place_attached()
 
-    def _save(self) -> dict[str, Any]:
+    def save_engine(self) -> dict[str, Any]:
         """Return what PyBullet writes into a file, and restore it at once.
 
         The contacts that the solver remembers are in no state that PyBullet restores. They are forgotten now, and at
@@ -319,7 +319,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
             "bullet": base64.b64encode(zlib.compress(data, 1)).decode(),
         }
 
-    def _restore(self, state: Any) -> None:
+    def restore_engine(self, state: Any) -> None:
         handling = set(state["handling"]) & set(self.bodies)
         poses = numbers("the snapshot", state["snapshot"], self._layout.size)
         try:
@@ -361,27 +361,27 @@ class PyBulletWorld(SimulatedWorld[Body]):
             self.client.setPhysicsEngineParameter(enableFileCaching=1)
         self._read_layout()
 
-    def _push(self, force: AppliedForce[Body]) -> None:
+    def push_link(self, force: AppliedForce[Body]) -> None:
         apply_force(self.client, force)
 
-    def _set_gravity(self, gravity: Sequence[float]) -> None:
+    def write_gravity(self, gravity: Sequence[float]) -> None:
         self.client.setGravity(*gravity)
         for body in self.bodies.values():
             body.edits += 1
 
-    def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
+    def cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
         return cast_ray(self.client, self.bodies.values(), start, end)
 
-    def _distance(self, a: Body, links_a: Sequence[int], b: Body, links_b: Sequence[int]) -> float | None:
+    def measure_distance(self, a: Body, links_a: Sequence[int], b: Body, links_b: Sequence[int]) -> float | None:
         return distance(self.client, a, links_a, b, links_b)
 
-    def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
+    def find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         return find_contacts(self.client, self.bodies.values(), a, b)
 
-    def _bounding_box(self, body: Body) -> tuple[list[float], list[float]]:
+    def measure_box(self, body: Body) -> tuple[list[float], list[float]]:
         return bounding_box(self.client, body)
 
-    def _paint(self, body: Body, rgba: list[float]) -> None:
+    def paint_body(self, body: Body, rgba: list[float]) -> None:
         if not self._drawn:
             return
         for link in {shape[1] for shape in self.client.getVisualShapeData(body.id)}:

@@ -123,7 +123,7 @@ class SceneEngine(WorldDriver, Generic[B]):
     """Dynamics that the engine does not have -> what to set instead."""
 
     @abstractmethod
-    def _place(self, spec: BodySpec | RobotSpec) -> B:
+    def load_body(self, spec: BodySpec | RobotSpec) -> B:
         """Load a body, whose name is new, into the engine. It need not stand at its initial pose yet.
 
         Raises:
@@ -131,62 +131,62 @@ class SceneEngine(WorldDriver, Generic[B]):
         """
 
     @abstractmethod
-    def _arrange(self, added: Sequence[B]) -> None:
+    def arrange_bodies(self, added: Sequence[B]) -> None:
         """Complete the world after bodies were added, before they are put home, or removed; ``bodies`` are up to date.
 
-        Objects that are attached (:meth:`_attachments`) leave physics here: they have no weight and touch nothing. Nor
+        Objects that are attached (:meth:`list_attachments`) leave physics here: no weight, no contacts. Nor
         does an arm touch the body of its robot (:meth:`SimulatedBody.ignored_by`).
         """
 
     @abstractmethod
-    def _take_out(self, body: B) -> None:
-        """Remove a body from the engine; :meth:`_arrange` follows."""
+    def unload_body(self, body: B) -> None:
+        """Remove a body from the engine; :meth:`arrange_bodies` follows."""
 
     @abstractmethod
-    def _follow_attached(self) -> None:
+    def place_attached(self) -> None:
         """Place every object that is attached at its link of an arm, after a step or a reset."""
 
     @abstractmethod
-    def _deepest_overlap(self, a: B, b: B) -> tuple[float, str, str]:
+    def find_overlap(self, a: B, b: B) -> tuple[float, str, str]:
         """Return how deep two bodies overlap, m, 0 if they are apart, and by which link of each.
 
         Links of :meth:`SimulatedBody.ignored_by` do not count.
         """
 
     @abstractmethod
-    def _read_pose(self, body: B, link: int) -> Transform:
+    def read_pose(self, body: B, link: int) -> Transform:
         """Return the pose in the world of a link's own frame."""
 
     @abstractmethod
-    def _read_velocity(self, body: B) -> tuple[Sequence[float], Sequence[float]]:
+    def read_velocity(self, body: B) -> tuple[Sequence[float], Sequence[float]]:
         """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
 
     @abstractmethod
-    def _move_base(self, body: B, pose: Transform) -> None:
+    def move_base(self, body: B, pose: Transform) -> None:
         """Place the base link there, at rest; its joints keep their positions."""
 
     @abstractmethod
-    def _move_joints(self, body: B, positions: Mapping[int, float]) -> None:
+    def move_joints(self, body: B, positions: Mapping[int, float]) -> None:
         """Place these joints (rad or m) at rest; those of a robot then hold there."""
 
     @abstractmethod
-    def _read_joints(self, body: B) -> Sequence[float]:
+    def read_joints(self, body: B) -> Sequence[float]:
         """Return the positions of the joints that move, rad or m, in the order of the URDF."""
 
     @abstractmethod
-    def _set_velocity(self, body: B, linear: Sequence[float], angular: Sequence[float]) -> None:
-        """Set the velocity of a free base, as of :meth:`_read_velocity`."""
+    def write_velocity(self, body: B, linear: Sequence[float], angular: Sequence[float]) -> None:
+        """Set the velocity of a free base, as of :meth:`read_velocity`."""
 
     @abstractmethod
-    def _read_dynamics(self, body: B, link: int) -> dict[str, Any]:
+    def read_dynamics(self, body: B, link: int) -> dict[str, Any]:
         """Return :data:`.values.DYNAMICS` of a link, without those of :attr:`UNSUPPORTED`."""
 
     @abstractmethod
-    def _write_dynamics(self, body: B, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
-        """Set properties of a link; ``before`` is what :meth:`_read_dynamics` returned just before."""
+    def write_dynamics(self, body: B, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+        """Set properties of a link; ``before`` is what :meth:`read_dynamics` returned just before."""
 
     @abstractmethod
-    def _forget(self, bodies: Sequence[B]) -> None:
+    def forget_contacts(self, bodies: Sequence[B]) -> None:
         """Clear what the solver keeps from one step to the next about these bodies.
 
         Called before they are reset, so that the steps after it repeat those after the start, and after their dynamics
@@ -194,50 +194,50 @@ class SceneEngine(WorldDriver, Generic[B]):
         """
 
     @abstractmethod
-    def _push(self, force: AppliedForce[B]) -> None:
+    def push_link(self, force: AppliedForce[B]) -> None:
         """Let a force act in the coming step, in addition to others on the same link."""
 
     @abstractmethod
-    def _set_gravity(self, gravity: Sequence[float]) -> None:
+    def write_gravity(self, gravity: Sequence[float]) -> None:
         """Set the gravity, (3,) m/s2 in the world."""
 
     @abstractmethod
-    def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
+    def cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
         """Return what a ray between two points (3,) in the world meets first; objects that are attached never."""
 
     @abstractmethod
-    def _distance(self, a: B, links_a: Sequence[int], b: B, links_b: Sequence[int]) -> float | None:
+    def measure_distance(self, a: B, links_a: Sequence[int], b: B, links_b: Sequence[int]) -> float | None:
         """Return the smallest distance between links of two bodies, m, negative if they overlap.
 
         None if one side has no collision shape.
         """
 
     @abstractmethod
-    def _find_contacts(self, a: B | None, b: B | None) -> list[dict[str, Any]]:
+    def find_contacts(self, a: B | None, b: B | None) -> list[dict[str, Any]]:
         """Return the contacts of the last step, as :meth:`contacts` does; None stands for any body."""
 
     @abstractmethod
-    def _bounding_box(self, body: B) -> tuple[list[float], list[float]]:
+    def measure_box(self, body: B) -> tuple[list[float], list[float]]:
         """Return the lower and upper corner (3,) m of the box along the world's axes around a body."""
 
     @abstractmethod
-    def _follow(self, body: B, q: list[float], dq: list[float], width: float | None) -> None:
+    def place_mirror(self, body: B, q: list[float], dq: list[float], width: float | None) -> None:
         """Place the mirror of a real arm; the numbers are checked."""
 
-    def _save(self) -> Any:
+    def save_engine(self) -> Any:
         """Return the state of the engine, as JSON; an engine has it with the motors', or without."""
         raise NotSupported(f"{self.ENGINE} does not save states", code="no_states")
 
-    def _restore(self, state: Any) -> None:
-        """Put the engine into a state of :meth:`_save`, of a world with the same bodies.
+    def restore_engine(self, state: Any) -> None:
+        """Put the engine into a state of :meth:`save_engine`, of a world with the same bodies.
 
         Raises:
             ValueError: It is no such state; nothing changes.
         """
         raise NotSupported(f"{self.ENGINE} does not restore states", code="no_states")
 
-    def _start(self, added: Sequence[B]) -> None:  # optional
+    def start_bodies(self, added: Sequence[B]) -> None:  # optional
         """Complete new bodies, which are now at their initial poses."""
 
-    def _paint(self, body: B, rgba: list[float]) -> None:  # most engines draw nothing
+    def paint_body(self, body: B, rgba: list[float]) -> None:  # most engines draw nothing
         """Change the colour of a body, where the engine itself draws."""

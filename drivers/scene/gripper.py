@@ -78,7 +78,7 @@ class FingerTravel:
     def reading(
         self, positions: Sequence[float], speeds: Sequence[float], efforts: Sequence[float]
     ) -> tuple[float, float, float, float]:
-        """Return width, its speed and the two forces of :meth:`SimulatedGripper._width` for what the joints have."""
+        """Return what :meth:`SimulatedGripper.read_width` does, for what the joints have."""
         n, ways = len(positions), self._ways
         share = sum([(p - c) / way for p, c, way in zip(positions, self._closed, ways, strict=True)]) / n
         slope = self._slope_at(share)
@@ -112,8 +112,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         if not isinstance(world, self.WORLD):
             text = f"{spec.name}: a simulated gripper needs its simulated world, not {world!r}"
             raise CommandError(text, code="world_missing")
-        self._world: W = world  # type: ignore[assignment]  # of that class
-        self._travel = FingerTravel(spec)
+        self.scene: W = world  # type: ignore[assignment]  # of that class
+        self.travel = FingerTravel(spec)
         self._open = False
         self._target = spec.width_max
         self._force = spec.force
@@ -137,17 +137,17 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     # --- what an engine implements -----------------------------------------------------------------------------------
 
     @abstractmethod
-    def _find(self) -> None:
-        """Find the fingers of :attr:`_body`."""
+    def find_device(self) -> None:
+        """Find the fingers of :attr:`body`."""
 
     @abstractmethod
-    def _width(self) -> tuple[float, float, float, float]:
+    def read_width(self) -> tuple[float, float, float, float]:
         """Return the width, m, its speed, m/s (positive opens), the force of the weaker motor, N (positive closes), and
         the greatest force of a motor in either direction, N.
         """
 
     @abstractmethod
-    def _drive(self, speed: float) -> None:
+    def drive_fingers(self, speed: float) -> None:
         """Drive the fingers to the width :attr:`_target` with :attr:`_force`; ``speed`` is that of the width, m/s.
 
         Where the travel :attr:`~FingerTravel.varies`, it is called before every step while the fingers move or hold
@@ -155,10 +155,10 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         """
 
     @abstractmethod
-    def _handle(self, active: bool) -> None:
+    def handle_fingers(self, active: bool) -> None:
         """Take notice whether the fingers move or hold something; else they need no coupling."""
 
-    def _resume(self) -> None:  # optional
+    def resume_motors(self) -> None:  # optional
         """Let the motors do what they did when a state was saved, if the engine's states are without those of motors.
 
         They moved at :attr:`_driven` to :attr:`_target`, or held there since a reset.
@@ -168,14 +168,14 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def open(self) -> None:
         """Find the fingers in the world; raises ConfigError when they belong to no robot."""
-        self._body: B = self._owner()
-        self._find()
+        self.body: B = self._owner()
+        self.find_device()
         self._was_reset()
         if not self._open:
-            self._world.on_reset(self._body.name, self._was_reset)
-            self._world.keep(f"{self._body.name}.gripper", self._save, self._restore)
-            if self._travel.varies:
-                self._world.before_steps(f"{self._body.name}.gripper", self._drive_on)
+            self.scene.on_reset(self.body.name, self._was_reset)
+            self.scene.keep(f"{self.body.name}.gripper", self._save, self._restore)
+            if self.travel.varies:
+                self.scene.before_steps(f"{self.body.name}.gripper", self._drive_on)
         self._open = True
 
     def read(self, now: float) -> GripperReading:
@@ -190,8 +190,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._engage(not idle)
         return GripperReading(
             t=now,
-            t_device=self._world.t,
-            seq=self._world.steps,
+            t_device=self.scene.t,
+            seq=self.scene.steps,
             width=width,
             width_target=self._target,
             moving=moving,
@@ -200,10 +200,10 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         )
 
     def _measure(self) -> tuple[float, float, float, float]:
-        """Return what :meth:`_width` returns, with the forces of the present state."""
-        width, speed, force, load = self._width()
+        """Return what :meth:`read_width` returns, with the forces of the present state."""
+        width, speed, force, load = self.read_width()
         step, *forces = self._placed
-        if step == self._world.steps:
+        if step == self.scene.steps:
             force, load = forces
         return width, speed, force, load
 
@@ -215,11 +215,11 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     def _engage(self, active: bool) -> None:
         """Take notice whether the fingers move or hold something."""
         self._engaged = active
-        self._handle(active)
+        self.handle_fingers(active)
 
     def _drive_on(self) -> None:
         if self._engaged and self._driven is not None:
-            self._drive(self._driven)
+            self.drive_fingers(self._driven)
 
     def _expect_open(self) -> None:
         if not self._open:
@@ -229,15 +229,15 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._expect_open()
         self._force = force
         self._speed = min(speed, self.spec.speed)
-        self._resting, self._stood_since = False, self._world.steps
+        self._resting, self._stood_since = False, self.scene.steps
         self._settle = max(SETTLE, 2.0 * STILL / self._speed)
         self._engage(True)
         self._driven = self._speed
-        self._drive(self._driven)
+        self.drive_fingers(self._driven)
 
     def _at_rest(self, width: float, speed: float) -> bool:
         """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""
-        step, dt = self._world.steps, self._world.dt
+        step, dt = self.scene.steps, self.scene.dt
         unseen, self._seen = (step - self._seen) * dt, step
         stood_long = (step - self._stood_since) * dt >= self._settle
         if abs(width - self._stood) > STILL:
@@ -259,17 +259,17 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._target = width
         self._engage(True)
         self._driven = self.spec.speed
-        self._drive(self._driven)
+        self.drive_fingers(self._driven)
 
     def close(self) -> None:
         """Disconnect; the motors hold, or press, for as long as the world exists."""
         if self._open:
-            self._world.off_reset(self._body.name, self._was_reset)
-            self._world.before_steps(f"{self._body.name}.gripper", None)
+            self.scene.off_reset(self.body.name, self._was_reset)
+            self.scene.before_steps(f"{self.body.name}.gripper", None)
         self._open = False
 
     def _save(self) -> dict[str, Any]:
-        now = self._world.steps
+        now = self.scene.steps
         _, _, pressed, load = self._measure()
         more = {"stood_for": now - self._stood_since, "unseen_for": now - self._seen, "pressed": pressed, "load": load}
         return {name: getattr(self, f"_{name}") for name in _KEPT} | more
@@ -277,21 +277,21 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     def _restore(self, state: dict[str, Any]) -> None:
         for name in _KEPT:
             setattr(self, f"_{name}", state[name])
-        now = self._world.steps
+        now = self.scene.steps
         self._stood_since, self._seen = now - state["stood_for"], now - state["unseen_for"]
         self._placed = (now, state["pressed"] or 0.0, state["load"] or 0.0)
-        self._resume()
+        self.resume_motors()
 
     def _was_reset(self) -> None:
         self._driven = None
-        self._target = self._stood = self._width()[0]
-        self._resting, self._stood_since = True, self._world.steps
+        self._target = self._stood = self.read_width()[0]
+        self._resting, self._stood_since = True, self.scene.steps
         self._force = self.spec.force
-        self._placed = (self._world.steps, 0.0, 0.0)
+        self._placed = (self.scene.steps, 0.0, 0.0)
 
     def _owner(self) -> B:
         """Return the only robot in the world that has this gripper."""
-        spec, bodies = self.spec, self._world.bodies.values()
+        spec, bodies = self.spec, self.scene.bodies.values()
         owners: list[B] = [body for body in bodies if isinstance(body.spec, RobotSpec) and body.spec.gripper == spec]
         if len(owners) != 1 or not spec.joints:
             message = f"{len(owners)} robots have it" if spec.joints else "names no finger joints"

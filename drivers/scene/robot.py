@@ -48,7 +48,7 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         if not isinstance(world, self.WORLD):
             text = f"{spec.name}: a simulated device needs its simulated world, not {world!r}"
             raise CommandError(text, code="world_missing")
-        self._world: W = world  # type: ignore[assignment]  # of that class
+        self.scene: W = world  # type: ignore[assignment]  # of that class
         self._open = False
         self._connected = True
         self._frozen: Reading | None = None
@@ -68,49 +68,49 @@ class SimulatedRobot(RobotDriver, Generic[W]):
     # --- what an engine implements -----------------------------------------------------------------------------------
 
     @abstractmethod
-    def _find(self) -> None:
+    def find_device(self) -> None:
         """Find the robot in the world; raises DeviceNotFound."""
 
     @abstractmethod
-    def _state(self) -> tuple[Floats, Floats, Floats]:
+    def read_state(self) -> tuple[Floats, Floats, Floats]:
         """Return positions (n,), velocities (n,), and the torques (n,) that the motors applied in the last step."""
 
     @abstractmethod
-    def _follow(self, q: Floats, dq: Floats) -> None:
+    def follow_setpoint(self, q: Floats, dq: Floats) -> None:
         """Let the motors bring the joints to ``q`` with the velocities ``dq`` by the end of the next step."""
 
     @abstractmethod
-    def _hold_at(self, q: Floats) -> None:
+    def hold_at(self, q: Floats) -> None:
         """Switch the motors on, if they are off, and let them hold the joints at ``q``."""
 
     @abstractmethod
-    def _take_over(self) -> None:
+    def release_motors(self) -> None:
         """Switch the motors off, because torques follow."""
 
     @abstractmethod
-    def _apply(self, tau: Floats) -> None:
+    def apply_torques(self, tau: Floats) -> None:
         """Apply torques (n,) on top of the compensation to the next step, in place of those applied to it before."""
 
     # --- the driver --------------------------------------------------------------------------------------------------
 
     def open(self) -> None:
         """Find the robot in the world; raises DeviceNotFound."""
-        self._find()
+        self.find_device()
         if not self._open:
-            self._world.on_reset(self.spec.name, self._was_reset)
-            self._world.keep(self.spec.name, self._save, self._restore)
+            self.scene.on_reset(self.spec.name, self._was_reset)
+            self.scene.keep(self.spec.name, self._save, self._restore)
         self._open = True
 
     def read(self, now: float) -> Reading:
         """Return the joints after the last physics step; ``tau`` is what the motors applied in it, Nm."""
         if not self._open or not self._connected:
             raise self._lost()
-        world = self._world
+        world = self.scene
         if self._tau is not None:
             self._keep_torques(self._tau)
         if self._freeze and self._frozen is not None:
             return self._frozen
-        q, dq, tau = self._state()
+        q, dq, tau = self.read_state()
         if self._tau is None and self._q is not None and self._dq is not None and world.fault is None:
             away = self._following.check(world.t, q, self._q, self._dq)
             if away is not None:
@@ -130,21 +130,21 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         q, dq, tau = setpoint.q, setpoint.dq, setpoint.tau
         if tau is not None:
             if self._tau is None:
-                self._take_over()
-            self._tau, self._received = tau, self._world.steps
+                self.release_motors()
+            self._tau, self._received = tau, self.scene.steps
             self._keep_torques(tau)
         else:
             if self._tau is not None:
                 self._hold(q)  # puts the motors' speed limits back
-            self._follow(q, dq)
+            self.follow_setpoint(q, dq)
         self._q, self._dq = q, dq
 
     def _keep_torques(self, tau: Floats) -> None:
         """Apply torques to each step and compensate gravity, as an arm's own controller does between commands."""
-        if (self._world.steps - self._received) * self._world.dt > HOLD_TIME:
+        if (self.scene.steps - self._received) * self.scene.dt > HOLD_TIME:
             self._hold(self._positions())
         else:
-            self._apply(tau)
+            self.apply_torques(tau)
 
     def halt(self) -> None:
         """Hold the last set-point; an arm that is driven by torques holds its present position."""
@@ -189,29 +189,29 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         """Disconnect; the motors hold the last set-point for as long as the world exists."""
         self.halt()
         if self._open:
-            self._world.off_reset(self.spec.name, self._was_reset)
+            self.scene.off_reset(self.spec.name, self._was_reset)
         self._open = False
 
     def _lost(self) -> ConnectionLost:
         return ConnectionLost(f"{self.spec.name} {'does not answer (injected)' if self._open else 'is not open'}")
 
     def _hold(self, q: Floats) -> None:
-        self._hold_at(q)
+        self.hold_at(q)
         self._q, self._dq = list(q), [0.0] * len(q)
         self._tau = None
 
     def _positions(self) -> Floats:
-        return self._state()[0]
+        return self.read_state()[0]
 
     def _save(self) -> dict[str, Any]:
         parts = {"q": self._q, "dq": self._dq, "tau": self._tau}
         state: dict[str, Any] = {name: None if part is None else list(part) for name, part in parts.items()}
-        return state | {"age": self._world.steps - self._received}
+        return state | {"age": self.scene.steps - self._received}
 
     def _restore(self, state: dict[str, Any]) -> None:
         self._frozen = None
         self._q, self._dq, self._tau = state["q"], state["dq"], state["tau"]
-        self._received = self._world.steps - state["age"]
+        self._received = self.scene.steps - state["age"]
         self._away = None
         self._following.forget()
 

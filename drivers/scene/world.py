@@ -42,8 +42,8 @@ OVERLAP = 0.005
 class SimulatedWorld(SceneEngine[B]):
     """A world of a physics engine, without the engine.
 
-    An engine's ``__init__`` prepares the engine and calls :meth:`_load` with all bodies and robots of the record, and
-    :meth:`_check_overlaps`.
+    An engine's ``__init__`` prepares it and calls :meth:`load_bodies` with all bodies and robots of its record, and
+    :meth:`check_overlaps`.
     """
 
     def __init__(self, spec: WorldSpec) -> None:
@@ -55,18 +55,18 @@ class SimulatedWorld(SceneEngine[B]):
         """Changes of poses other than by steps, and of looks."""
         self._edited_at = 0
         """The step after which the world was edited last."""
-        self._forces: list[AppliedForce[B]] = []
+        self.forces: list[AppliedForce[B]] = []
         """Forces on links that act in the coming step."""
         self._gravity = list(spec.gravity)
         self._on_reset: dict[str, list[Callable[[], None]]] = {}
         self._on_edit: list[Callable[[str, dict[str, Any], int], None]] = []
-        self._before_steps: dict[str, Callable[[], None]] = {}
+        self.preparations: dict[str, Callable[[], None]] = {}
         self._kept: dict[str, tuple[Callable[[], Any], Callable[[Any], None]]] = {}
         """How the states of drivers are saved and restored."""
 
     # --- loading -----------------------------------------------------------------------------------------------------
 
-    def _load(self, specs: Sequence[BodySpec | RobotSpec]) -> None:
+    def load_bodies(self, specs: Sequence[BodySpec | RobotSpec]) -> None:
         """Load bodies and put them home; raises ConfigError with the problems of all of them."""
         problems: list[Problem] = []
         added: list[B] = []
@@ -76,7 +76,7 @@ class SimulatedWorld(SceneEngine[B]):
                 problems.append(Problem("world", spec.name, message, "duplicate_name"))
                 continue
             try:
-                added.append(self._place(spec))
+                added.append(self.load_body(spec))
                 self.bodies[spec.name] = added[-1]
             except ConfigError as error:
                 problems.extend(error.problems)
@@ -84,13 +84,13 @@ class SimulatedWorld(SceneEngine[B]):
         if problems:
             raise ConfigError(problems)
         self._renumber()
-        self._arrange(added)
+        self.arrange_bodies(added)
         for body in added:
             self._put_home(body)
-        self._start(added)
-        self._follow_attached()
+        self.start_bodies(added)
+        self.place_attached()
 
-    def _is_mirrored(self, body: B) -> bool:
+    def is_mirrored(self, body: B) -> bool:
         """Return whether another driver moves this arm, so that it mirrors a real one."""
         return isinstance(body.spec, RobotSpec) and body.spec.driver != self.spec.driver
 
@@ -114,7 +114,7 @@ class SimulatedWorld(SceneEngine[B]):
                 problems.append(Problem("objects", f"{key}.link", text, "unknown_link"))
         return problems
 
-    def _attachments(self) -> list[tuple[B, B, int]]:
+    def list_attachments(self) -> list[tuple[B, B, int]]:
         """Return each attached object, its arm, and the number of the arm's link."""
         found = []
         for body in self.bodies.values():
@@ -124,19 +124,19 @@ class SimulatedWorld(SceneEngine[B]):
                 found.append((body, arm, self.link(arm, spec.link)))
         return found
 
-    def _parts(self, added: Sequence[B]) -> Iterator[tuple[B, B, frozenset[int]]]:
+    def list_parts(self, added: Sequence[B]) -> Iterator[tuple[B, B, frozenset[int]]]:
         """Yield each new arm of the same robot as another one, that one, and the links of it that it never touches."""
         for part in added:
             whole = self.bodies.get(getattr(part.spec, "same", None) or "")
             if whole is not None:
                 yield part, whole, whole.ignored_by(part)
 
-    def _check_overlaps(self) -> None:
+    def check_overlaps(self) -> None:
         """Refuse arms that overlap at the start: the solver would throw them apart."""
-        robots = [body for body in self.bodies.values() if body.is_robot and not self._is_mirrored(body)]
+        robots = [body for body in self.bodies.values() if body.is_robot and not self.is_mirrored(body)]
         problems = []
         for a, b in combinations(robots, 2):
-            depth, link_a, link_b = self._deepest_overlap(a, b)
+            depth, link_a, link_b = self.find_overlap(a, b)
             if depth > OVERLAP:
                 message = f"starts {depth:.3f} m inside robot {a.name!r} (its {link_b} in {link_a})"
                 remedy = f"change its base or initial, or add same: {a.name} if both are arms of one robot"
@@ -148,14 +148,14 @@ class SimulatedWorld(SceneEngine[B]):
     def _report_overlaps(self, added: Iterable[B]) -> None:
         """Warn of free objects among ``added`` that are inside of something: the solver pushes them out anywhere."""
         loose = {body.name for body in added if body.floating and not body.carried}
-        boxes = {name: self._bounding_box(body) for name, body in self.bodies.items() if loose and not body.carried}
+        boxes = {name: self.measure_box(body) for name, body in self.bodies.items() if loose and not body.carried}
         for one, other in combinations(boxes, 2):
             if one not in loose:
                 one, other = other, one
             (lower, upper), (least, most) = boxes[one], boxes[other]
             if one not in loose or any(map(gt, lower, most)) or any(map(gt, least, upper)):
                 continue
-            depth = self._deepest_overlap(self.bodies[one], self.bodies[other])[0]
+            depth = self.find_overlap(self.bodies[one], self.bodies[other])[0]
             if depth > OVERLAP:
                 text = f"{one} starts {depth:.3f} m inside {other}, which may push it out to any side"
                 self.warnings.append(f"{text}: change its position")
@@ -197,12 +197,12 @@ class SimulatedWorld(SceneEngine[B]):
     def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
         """Return the pose of a link's frame in the world; of the base link when none is named."""
         body = self.body(name)
-        return pose_json(self._read_pose(body, self.link(body, link)))
+        return pose_json(self.read_pose(body, self.link(body, link)))
 
     def poses(self, names: Sequence[str] | None = None) -> dict[str, Any]:
         """Return ``poses`` of base links by name, of all bodies for None, and ``t``, the simulated time, s."""
         found = self.bodies.values() if names is None else [self.body(name) for name in names]
-        poses = {body.name: pose_json(self._read_pose(body, self.link(body, None))) for body in found}
+        poses = {body.name: pose_json(self.read_pose(body, self.link(body, None))) for body in found}
         return {"t": self.t, "poses": poses}
 
     def set_pose(self, name: str, pose: Mapping[str, Sequence[float]]) -> None:
@@ -213,12 +213,12 @@ class SimulatedWorld(SceneEngine[B]):
         self._expect_free(body)
         there = transform(pose)
         self._note_edit()
-        self._move_base(body, there)
+        self.move_base(body, there)
 
     def joint_positions(self, name: str) -> dict[str, float]:
         """Return the position of each joint that moves, rad or m, in the order of the URDF."""
         body = self.body(name)
-        return dict(zip(movable_joints(body), self._read_joints(body), strict=True))
+        return dict(zip(movable_joints(body), self.read_joints(body), strict=True))
 
     def set_joint_positions(self, name: str, positions: Mapping[str, float]) -> None:
         """Place joints of an object: see :meth:`hal.world.World.set_joint_positions`."""
@@ -227,11 +227,11 @@ class SimulatedWorld(SceneEngine[B]):
             raise CommandError(f"{name!r} is a robot: its servo moves it; reset(q=...) places it", code="is_robot")
         wanted = joints_to_place(body, positions)
         self._note_edit()
-        self._move_joints(body, wanted)
+        self.move_joints(body, wanted)
 
     def velocity(self, name: str) -> list[list[float]]:
         """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
-        return [list(part) for part in self._read_velocity(self.body(name))]
+        return [list(part) for part in self.read_velocity(self.body(name))]
 
     def set_velocity(
         self, name: str, linear: Sequence[float] = (0.0, 0.0, 0.0), angular: Sequence[float] = (0.0, 0.0, 0.0)
@@ -240,7 +240,7 @@ class SimulatedWorld(SceneEngine[B]):
         body = self.body(name)
         if not body.floating:
             raise CommandError(f"the base of {name!r} is fixed: it has no velocity to set", code="base_fixed")
-        self._set_velocity(body, numbers("linear", linear, 3), numbers("angular", angular, 3))
+        self.write_velocity(body, numbers("linear", linear, 3), numbers("angular", angular, 3))
 
     def apply_force(
         self,
@@ -254,32 +254,32 @@ class SimulatedWorld(SceneEngine[B]):
         body = self.body(name)
         number = self.link(body, link)
         self._expect_free(body)
-        if self._is_mirrored(body):
+        if self.is_mirrored(body):
             raise CommandError(f"{name!r} mirrors a real arm: nothing in the simulation moves it", code="is_mirrored")
         if not (body.floating or (number != self.link(body, None) and body.movable)):
             raise CommandError(f"the base of {name!r} is fixed: a force does not move it", code="base_fixed")
         pushed, at = numbers("force", force, 3), None
         if point is not None:
             there = numbers("point", point, 3)
-            at = compose(inverse(self._read_pose(body, number)), (tuple(there), (0.0, 0.0, 0.0, 1.0)))[0]
+            at = compose(inverse(self.read_pose(body, number)), (tuple(there), (0.0, 0.0, 0.0, 1.0)))[0]
         steps = 1
         if duration is not None:
             (seconds,) = numbers("duration", [duration])
             if seconds <= 0.0:
                 raise CommandError(f"duration must be more than 0 s, not {duration}")
             steps = max(1, round(seconds / self.dt))
-        self._forces.append(AppliedForce(body, number, pushed, at, steps))
+        self.forces.append(AppliedForce(body, number, pushed, at, steps))
 
-    def _spend_forces(self) -> None:
+    def spend_forces(self) -> None:
         """Note that a step was made with the present forces."""
-        for force in self._forces:
+        for force in self.forces:
             force.steps -= 1
-        self._forces = [force for force in self._forces if force.steps > 0]
+        self.forces = [force for force in self.forces if force.steps > 0]
 
     def set_gravity(self, gravity: Sequence[float]) -> list[float]:
         """Set the gravity, (3,) m/s2 in the world, and return the previous one."""
         before, self._gravity = self._gravity, numbers("gravity", gravity, 3)
-        self._set_gravity(self._gravity)
+        self.write_gravity(self._gravity)
         return before
 
     def ray(self, start: Sequence[float], end: Sequence[float]) -> dict[str, Any] | None:
@@ -287,7 +287,7 @@ class SimulatedWorld(SceneEngine[B]):
         here, there = numbers("start", start, 3), numbers("end", end, 3)
         if math.dist(here, there) < 1e-9:
             raise CommandError("a ray needs two different points, start and end")
-        found = self._cast_ray(here, there)
+        found = self.cast_ray(here, there)
         if found is None:
             return None
         body, link, position, normal = found
@@ -308,7 +308,7 @@ class SimulatedWorld(SceneEngine[B]):
             [self.link(body, link)] if link is not None else [*{*body.links.values()} - body.ignored_by(other)]
             for body, other, link in ((first, second, link_a), (second, first, link_b))
         )
-        found = self._distance(first, links_a, second, links_b)
+        found = self.measure_distance(first, links_a, second, links_b)
         if found is None:
             raise CommandError(f"{a!r} or {b!r} has no collision shape there", code="no_shape")
         return found
@@ -316,7 +316,7 @@ class SimulatedWorld(SceneEngine[B]):
     def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
         """Return those of :data:`.values.DYNAMICS` that the engine has."""
         body = self.body(name)
-        return self._read_dynamics(body, self.link(body, link))
+        return self.read_dynamics(body, self.link(body, link))
 
     def set_dynamics(self, name: str, link: str | None = None, **values: Any) -> dict[str, Any]:
         """Set some values of :meth:`dynamics`, check that the engine took them, and return the previous ones.
@@ -329,14 +329,14 @@ class SimulatedWorld(SceneEngine[B]):
         for key in wanted:
             if key in self.UNSUPPORTED:
                 raise NotSupported(f"{self.ENGINE} has no {key}: {self.UNSUPPORTED[key]}", code="no_such_quantity")
-        before = self._read_dynamics(body, number)
+        before = self.read_dynamics(body, number)
         wanted = completed_dynamics(name, wanted, before)
-        self._write_dynamics(body, number, wanted, before)
-        after = self._read_dynamics(body, number)
+        self.write_dynamics(body, number, wanted, before)
+        after = self.read_dynamics(body, number)
         for key, value in wanted.items():
             if not same_value(after[key], value):
                 raise NotSupported(f"{self.ENGINE} did not take {key} = {value} for {name!r}: it holds {after[key]}")
-        self._forget([body])
+        self.forget_contacts([body])
         self._edited_at = self.steps
         return {key: before[key] for key in wanted}
 
@@ -353,7 +353,7 @@ class SimulatedWorld(SceneEngine[B]):
             a, b = b, None
         first, second = (None if name is None else self.body(name) for name in (a, b))
         stale = self._edited_at == self.steps
-        found = [] if stale else self._find_contacts(first, second)
+        found = [] if stale else self.find_contacts(first, second)
         return {"t": None if stale else self.t, "contacts": found} if stamped else found
 
     def _note_edit(self) -> None:
@@ -366,7 +366,7 @@ class SimulatedWorld(SceneEngine[B]):
 
         It may be larger by the engine's collision margin (mm).
         """
-        lower, upper = self._bounding_box(self.body(name))
+        lower, upper = self.measure_box(self.body(name))
         return {"lower": lower, "upper": upper}
 
     def add(self, spec: Mapping[str, Any] | BodySpec) -> int:
@@ -376,7 +376,7 @@ class SimulatedWorld(SceneEngine[B]):
         problems = self._attachment_problems([record])
         if problems:
             raise ConfigError(problems)
-        self._load([record])
+        self.load_bodies([record])
         self._report_overlaps([self.bodies[record.name]])
         return self._edited("add", spec=to_json(record))
 
@@ -385,11 +385,11 @@ class SimulatedWorld(SceneEngine[B]):
         body = self.body(name)
         if body.is_robot:
             raise CommandError(f"{name!r} is a robot: robots stay in the world", code="is_robot")
-        self._take_out(body)
+        self.unload_body(body)
         del self.bodies[name]
-        self._forces = [force for force in self._forces if force.body is not body]
+        self.forces = [force for force in self.forces if force.body is not body]
         self._renumber()
-        self._arrange(())
+        self.arrange_bodies(())
         return self._edited("remove", name=name)
 
     def set_color(self, name: str, rgba: Sequence[float]) -> int:
@@ -398,7 +398,7 @@ class SimulatedWorld(SceneEngine[B]):
         color = numbers("rgba", rgba, 4)
         if not all(0.0 <= value <= 1.0 for value in color):
             raise CommandError(f"rgba of {name!r} must be numbers in 0..1, not {color}")
-        self._paint(body, color)
+        self.paint_body(body, color)
         return self._edited("set_color", name=name, rgba=color)
 
     def _edited(self, method: str, **params: Any) -> int:
@@ -431,14 +431,14 @@ class SimulatedWorld(SceneEngine[B]):
             if pose is not None or q is not None:
                 raise CommandError("reset with a pose or with q needs the name of a body", code="name_missing")
             everything = list(self.bodies.values())
-            self._forget(everything)
+            self.forget_contacts(everything)
             for body in everything:
-                if not self._is_mirrored(body):
+                if not self.is_mirrored(body):
                     self._put_home(body)
-            self._follow_attached()
+            self.place_attached()
             return
         body = self.body(name)
-        if self._is_mirrored(body):
+        if self.is_mirrored(body):
             raise CommandError(f"{name!r} mirrors a real arm; move that", code="is_mirrored")
         base = body.base
         if pose is not None:
@@ -447,9 +447,9 @@ class SimulatedWorld(SceneEngine[B]):
             self._expect_free(body)
             base = transform(pose)
         joints = body.home if q is None else {**body.home, **reset_positions(body, q)}
-        self._forget([body])
+        self.forget_contacts([body])
         self._put(body, base, joints)
-        self._follow_attached()
+        self.place_attached()
 
     def save(self) -> dict[str, Any]:
         """Return the state of the world and of its drivers: see :meth:`hal.world.World.save`."""
@@ -459,9 +459,9 @@ class SimulatedWorld(SceneEngine[B]):
             "drivers": {name: save() for name, (save, _) in self._kept.items()},
             "forces": [
                 [one.body.name, one.body.link_name(one.link), list(one.force), one.point and list(one.point), one.steps]
-                for one in self._forces
+                for one in self.forces
             ],
-            "state": self._save(),
+            "state": self.save_engine(),
         }
 
     def restore(self, state: Any) -> None:
@@ -473,12 +473,12 @@ class SimulatedWorld(SceneEngine[B]):
             raise CommandError("the state of an arm or a gripper in it is none of this world's", code="wrong_state")
         try:
             forces = [self._saved_force(*force) for force in state["forces"]]
-            self._restore(state["state"])
+            self.restore_engine(state["state"])
         except (AttributeError, DeviceNotFound, CommandError, KeyError, ValueError, TypeError) as error:
             raise CommandError(f"the state cannot be restored: {error}", code="wrong_state") from error
-        self._forces = forces
+        self.forces = forces
         self._note_edit()
-        self._follow_attached()
+        self.place_attached()
         for name, (_, restore) in self._kept.items():
             if name in drivers:
                 restore(drivers[name])
@@ -497,10 +497,10 @@ class SimulatedWorld(SceneEngine[B]):
 
     def _put(self, body: B, base: Transform, joints: Mapping[int, float]) -> None:
         self._note_edit()
-        self._forces = [force for force in self._forces if force.body is not body]
+        self.forces = [force for force in self.forces if force.body is not body]
         if not body.carried:
-            self._move_base(body, base)
-        self._move_joints(body, joints)
+            self.move_base(body, base)
+        self.move_joints(body, joints)
         for callback in self._on_reset.get(body.name, ()):
             callback()
 
@@ -512,14 +512,14 @@ class SimulatedWorld(SceneEngine[B]):
 
     def follow(self, name: str, q: Sequence[float], dq: Sequence[float], width: float | None = None) -> None:
         body = self.body(name)
-        if not self._is_mirrored(body):
+        if not self.is_mirrored(body):
             raise CommandError(f"{name!r} is not the mirror of a real arm", code="not_mirrored")
         assert isinstance(body.spec, RobotSpec)
         count = len(body.spec.joints)
         positions, speeds = numbers(f"q of {name!r}", q, count), numbers(f"dq of {name!r}", dq, count)
         if width is not None:
             (width,) = numbers(f"the width of {name!r}", [width])
-        self._follow(body, positions, speeds, width)
+        self.place_mirror(body, positions, speeds, width)
         self._changes += 1
 
     def body(self, name: str) -> B:
@@ -549,9 +549,9 @@ class SimulatedWorld(SceneEngine[B]):
     def before_steps(self, name: str, callback: Callable[[], None] | None) -> None:
         """Call ``callback`` before each step, in place of that of the same name; None ends it."""
         if callback is not None:
-            self._before_steps[name] = callback
+            self.preparations[name] = callback
         else:
-            self._before_steps.pop(name, None)
+            self.preparations.pop(name, None)
 
     def on_edit(self, callback: Callable[[str, dict[str, Any], int], None]) -> None:
         self._on_edit.append(callback)

@@ -85,7 +85,9 @@ def test_nan_from_the_arm_stops_it_and_no_set_point_becomes_nan(arm: FakeArm) ->
         moved = len(arm.log)
         assert moved > 10
         assert all(map(math.isfinite, (x for setpoint in arm.log for x in setpoint)))
-        arm.nan = False
+        arm.nan, since = False, rig.clock.now()
+        while robot.state(max_age=math.inf).stamp.t <= since:
+            rig.clock.sleep(0.01)
         goal = robot.home + 0.05
         assert abs(robot.move_to(goal, unattended=True).q - goal).max() < 1e-6
         assert len(arm.log) > moved

@@ -18,7 +18,7 @@ import pytest
 from ..errors import CommandError, ConfigError, DeviceNotFound, HalError, NotSupported
 from ..specs import to_json
 from ..world import WorldDriver
-from .benches import Contract
+from .benches import Contract, needs
 from .world_bench import FINGERS, GRAVITY, JOINTS, UPRIGHT, WorldBench, body, cabinet, cube, floor
 
 __all__ = ["WorldContract"]
@@ -49,8 +49,11 @@ def _speed(world: WorldDriver, name: str) -> float:
 class WorldContract(Contract):
     """Checks of a simulated world. The bench is a :class:`~hal.testing.WorldBench`.
 
-    Nothing may be left out.
+    ``left_out`` may name ``physics``, for an engine that only places bodies: without gravity, forces, contacts, shapes
+    and dynamics, whose requests raise NotSupported or find nothing.
     """
+
+    abilities = ("physics",)
 
     @pytest.fixture(autouse=True)
     def _close_worlds(self, bench: WorldBench) -> Iterator[None]:
@@ -61,6 +64,7 @@ class WorldContract(Contract):
 
     # Time.
 
+    @needs("physics")
     def test_a_step_is_one_period_of_the_physics(self, bench: WorldBench) -> None:
         world = bench.world(cube((0.0, 0.0, 1.0)), physics_hz=500.0)
         assert (world.dt, world.t, world.steps) == (0.002, 0.0, 0)
@@ -118,6 +122,7 @@ class WorldContract(Contract):
         assert found["poses"] == {name: world.request("pose", {"name": name}) for name in ("floor", "cube")}
         assert list(world.request("poses", {"names": ["cube"]})["poses"]) == ["cube"]
 
+    @needs("physics")
     @pytest.mark.parametrize(
         ("shape", "size", "half"),
         [
@@ -137,6 +142,7 @@ class WorldContract(Contract):
         _steps(world, 1.0)
         assert _position(world, "it")[2] == pytest.approx(half[2], abs=0.003)
 
+    @needs("physics")
     def test_a_placed_body_is_at_rest(self, bench: WorldBench) -> None:
         world = _steps(bench.world(cube((0.0, 0.0, 1.0))), 0.3)
         assert _speed(world, "cube") > 2.0
@@ -157,6 +163,7 @@ class WorldContract(Contract):
         assert np.allclose((x, y), 0.0, atol=1e-6)
         assert 2 * math.atan2(z, w) == pytest.approx(0.2, abs=0.01)
 
+    @needs("physics")
     def test_a_force_accelerates_a_body_for_as_long_as_it_acts(self, bench: WorldBench, tmp_path: Path) -> None:
         arm = bench.arm(tmp_path, base_position=(3.0, 0.0, 0.0))
         world = bench.world(cube((0.0, 0.0, 1.0)), cube((1.0, 0.0, 1.0), name="fixed", fixed=True), arm)
@@ -188,6 +195,7 @@ class WorldContract(Contract):
                 world.request("apply_force", {"force": [1, 0, 0], **params})
             assert refused.value.code == code, params
 
+    @needs("physics")
     def test_a_ray_meets_the_nearest_body(self, bench: WorldBench) -> None:
         world = bench.world(floor(), cube((0.0, 0.0, 1.0)), cube((0.0, 0.0, 2.0), name="seen", collision=False))
         hit = world.request("ray", {"start": [0, 0, 3], "end": [0, 0, -1]})
@@ -197,6 +205,7 @@ class WorldContract(Contract):
         assert world.request("ray", {"start": [1, 0, 3], "end": [1, 0, -1]})["name"] == "floor"
         assert world.request("ray", {"start": [1, 0, 3], "end": [1, 0, 1]}) is None
 
+    @needs("physics")
     def test_the_distance_of_two_bodies(self, bench: WorldBench, tmp_path: Path) -> None:
         world = bench.world(floor(), cube((0.0, 0.0, 1.0)), bench.arm(tmp_path, base_position=(0.0, 1.0, 0.5)))
         base = world.request("distance", {"a": "arm", "b": "cube", "link_a": "base"})
@@ -218,6 +227,7 @@ class WorldContract(Contract):
             world.request("set_velocity", {"name": "cube", "linear": [1, 0, 0]})
         assert refused.value.code == "base_fixed"
 
+    @needs("physics")
     def test_a_body_without_collision_touches_nothing(self, bench: WorldBench) -> None:
         world = _steps(bench.world(floor(), cube((0.0, 0.0, 0.1), collision=False)), 0.5)
         assert _position(world, "cube")[2] < -0.5
@@ -247,6 +257,7 @@ class WorldContract(Contract):
             assert refused.value.code == code, positions
         assert world.request("joint_positions", {"name": "cabinet"}) == pytest.approx(there), "nothing changed"
 
+    @needs("physics")
     def test_the_joints_of_an_object_have_the_friction_and_damping_of_its_file(
         self, bench: WorldBench, tmp_path: Path
     ) -> None:
@@ -261,6 +272,7 @@ class WorldContract(Contract):
 
     # Contacts and dynamics.
 
+    @needs("physics")
     def test_contacts_hold_the_weight(self, bench: WorldBench) -> None:
         world = _steps(bench.world(floor(), cube((0.0, 0.0, 0.051), mass=2.0)), 1.0)
         contacts = world.request("contacts", {"a": "cube", "b": "floor"})
@@ -275,6 +287,7 @@ class WorldContract(Contract):
         assert len(world.request("contacts", {})) == len(contacts)
         assert world.request("contacts", {"a": "cube"}) == contacts
 
+    @needs("physics")
     def test_directly_after_an_edit_there_are_no_contacts_yet(self, bench: WorldBench) -> None:
         world = _steps(bench.world(floor(), cube((0.0, 0.0, 0.051))), 0.5)
         for method, params in (
@@ -288,6 +301,7 @@ class WorldContract(Contract):
             world.request(method, params)
             assert world.request("contacts", {"stamped": True}) == {"t": None, "contacts": []}
 
+    @needs("physics")
     def test_half_of_a_soft_contact_is_refused_with_the_other_half(self, bench: WorldBench) -> None:
         world = bench.world(cube((0.0, 0.0, 1.0)))
         with pytest.raises(CommandError) as refused:
@@ -297,6 +311,7 @@ class WorldContract(Contract):
         world.request("set_dynamics", {"name": "cube", "contact_damping": 1.0, "contact_stiffness": float(proposed)})
         assert world.request("dynamics", {"name": "cube"})["contact_damping"] == pytest.approx(1.0)
 
+    @needs("physics")
     def test_set_dynamics_returns_what_was_set_before(self, bench: WorldBench) -> None:
         world = bench.world(floor(), cube((0.0, 0.0, 0.05)))
         before = world.request("dynamics", {"name": "cube"})
@@ -312,6 +327,7 @@ class WorldContract(Contract):
         assert again.pop("inertia") == pytest.approx(before.pop("inertia"))
         assert again == pytest.approx(before)
 
+    @needs("physics")
     def test_less_friction_lets_a_body_slide_farther(self, bench: WorldBench) -> None:
         ways = []
         for friction in (0.4, 0.8):
@@ -324,6 +340,7 @@ class WorldContract(Contract):
             assert _speed(world, "cube") < 0.02
         assert ways[0] > 1.3 * ways[1]
 
+    @needs("physics")
     @pytest.mark.parametrize(
         "values", [{"mass": -1.0}, {"lateral_friction": math.nan}, {"colour": 1.0}, {"mass": "heavy"}]
     )
@@ -334,6 +351,7 @@ class WorldContract(Contract):
             world.request("set_dynamics", {"name": "cube", **values})
         assert world.request("dynamics", {"name": "cube"}) == before
 
+    @needs("physics")
     @pytest.mark.parametrize("name", _PROPERTIES)
     def test_a_property_exists_or_is_refused_by_name(self, bench: WorldBench, name: str) -> None:
         world = bench.world(cube((0.0, 0.0, 1.0)))
@@ -368,6 +386,7 @@ class WorldContract(Contract):
         assert announced == [("add", 1), ("set_color", 2), ("remove", 3)]
         assert world.request("names", {}) == ["floor"]
 
+    @needs("physics")
     def test_an_added_body_comes_last_and_takes_part(self, bench: WorldBench, tmp_path: Path) -> None:
         world = _steps(bench.world(floor(), bench.arm(tmp_path)), 0.2)
         before = world.snapshot()
@@ -427,6 +446,7 @@ class WorldContract(Contract):
             with pytest.raises(CommandError):
                 world.request(method, params)
 
+    @needs("physics")
     def test_results_travel_as_json(self, bench: WorldBench, tmp_path: Path) -> None:
         world = _steps(bench.world(floor(), cube((1.0, 0.0, 0.05)), bench.arm(tmp_path)), 0.1)
         for method, params in (
@@ -454,6 +474,7 @@ class WorldContract(Contract):
         assert world.t == pytest.approx(0.4), "time continues"
         assert np.allclose(_steps(world, 0.4).snapshot(), first, atol=1e-9), "and takes the same course again"
 
+    @needs("physics")
     def test_reset_of_one_body_to_another_state(self, bench: WorldBench, tmp_path: Path) -> None:
         world = bench.world(cube((1.0, 0.0, 1.0)), bench.arm(tmp_path))
         _steps(world, 0.1)

@@ -74,6 +74,9 @@ class WorldBench(Bench):
     made: list[WorldDriver] = field(default_factory=list)
     """The worlds so far."""
 
+    def has(self, ability: str) -> bool:
+        return ability == "physics" or super().has(ability)
+
     def world(self, *things: BodySpec | RobotSpec, **changes: Any) -> WorldDriver:
         """Return a world of these objects and arms at 240 Hz; ``changes`` are fields of its record."""
         bodies = tuple(thing for thing in things if isinstance(thing, BodySpec))
