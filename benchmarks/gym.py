@@ -16,7 +16,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-from hal.gym import RigEnv, TaskEnv, make_vec
+from hal.gym import EnvSettings, RigEnv, TaskEnv, make_vec
 from hal.learning.tasks import TASKS
 
 from .kit import ENGINES, Table, median, median_ratio, per_second, run_in_turns, sum_of_programs
@@ -24,6 +24,7 @@ from .lock_step import CONFIG, POLICY_HZ, by_hand
 
 PATHS = (
     "hal/learning/gym.py",
+    "hal/learning/spaces.py",
     "hal/learning/tasks",
     "hal/learning/vector.py",
     "hal/servo",
@@ -39,7 +40,7 @@ Step = Callable[[], None]
 
 def make(engine: str = "auto", cameras: bool = False) -> RigEnv:
     """Return one environment in lock-step."""
-    return RigEnv(CONFIG, sim=True, engine=engine, rate_hz=POLICY_HZ, overrides=() if cameras else BARE)
+    return RigEnv(CONFIG, EnvSettings(rate_hz=POLICY_HZ), sim=True, engine=engine, overrides=() if cameras else BARE)
 
 
 def stepping(env: RigEnv | gymnasium.vector.VectorEnv) -> Step:
@@ -93,7 +94,7 @@ def memory(processes: Iterable[int]) -> float:
 def many_worlds(engine: str, worlds: int, seconds: float, rounds: int) -> Table:
     """Return steps/s of all worlds together, those of ways that make many of them beside one RigEnv."""
     one, threaded = make(engine), [make(engine) for _ in range(worlds)]
-    vector = make_vec(CONFIG, worlds, sim=True, engine=engine, rate_hz=POLICY_HZ, overrides=BARE)
+    vector = make_vec(partial(make, engine), worlds)
     asynchronous = gymnasium.vector.AsyncVectorEnv([partial(make, engine)] * worlds, context="spawn")
     steps = [stepping(env) for env in threaded]
     with ThreadPoolExecutor(CORES) as pool:
