@@ -45,6 +45,8 @@ class Hand:
         self._env = env
         self._base = base.inverse() @ robot.base
         self._turn = self._base.matrix()[:3, :3].T
+        self.ahead = yaw_of(self._base)
+        """Turn of the hand about z that is straight ahead for this arm, rad."""
 
     @property
     def gripper(self) -> Gripper:
@@ -101,12 +103,20 @@ class Hand:
             raise NotSupported(text, code="too_wide")
 
     def reach(self, position: ArrayLike, yaw: float, what: str) -> Array:
-        """Return joint positions (n,), rad, with the hand over or around something. Raises CommandError."""
+        """Return joint positions (n,), rad, with the hand over or around something.
+
+        ``yaw`` is its turn about z from straight ahead, rad.
+
+        Raises:
+            CommandError: There are none (code ``out_of_reach``).
+        """
         x, y, z = np.asarray(position, float)
-        goal = Pose.from_rpy((x, y, max(z, GRASP_HEIGHT)), (math.pi, 0.0, yaw))
+        goal = Pose.from_rpy((x, y, max(z, GRASP_HEIGHT)), (math.pi, 0.0, self.ahead + yaw))
         try:
             q = self.robot.ik(self._base.inverse() @ goal, self.robot.home)
-            touched = self.robot.collisions.check(q)
+            others = tuple(f"{name}/" for name in self._env.rig.robots if name != self.robot.name)  # they move
+            pairs = self.robot.collisions.check(q)
+            touched = [pair for pair in pairs if not (pair.first.startswith(others) or pair.second.startswith(others))]
         except Unreachable:
             why = "the arm does not get there"
         else:

@@ -46,6 +46,8 @@ _DISTANCES = (0.5, 0.45, 0.4, 0.35, 0.3, 0.25)
 """Distances of the middle of the work area from the base, m; the first at which the arm reaches all of it is taken."""
 _APART = 1.0
 """Distance of the bases of two arms, m."""
+_ASIDE = 0.15
+"""Distance of the hands of two arms from the middle of the work area at the start, m."""
 _TURN = 0.25 * math.pi
 """Greatest turn of the hand about the vertical, either way, with which the arm must reach all of it, rad."""
 _BOUND = 2.0
@@ -251,10 +253,14 @@ class TaskEnv(RigEnv):
         return Pose.from_rpy((x, y, height), (0.0, 0.0, self.np_random.uniform(-_TURN, _TURN)))
 
     def go(self, position: ArrayLike, yaw: float, grip: float, hand: int = 0) -> Iterator[Action]:
-        """Yield actions until a tcp is at a position (3,), m, and its hand at a turn about z, rad; at most 15 s."""
+        """Yield actions until a tcp is at a position (3,), m, and its hand turned by ``yaw`` about z; at most 15 s.
+
+        A ``yaw`` of 0 is straight ahead for that arm, rad.
+        """
         for _ in range(_LONGEST):
             tcp = self.hands[hand].tcp
-            off = np.append(np.subtract(position, tcp.position), fold(yaw - yaw_of(tcp), 2.0 * math.pi))
+            turn = fold(self.hands[hand].ahead + yaw - yaw_of(tcp), 2.0 * math.pi)
+            off = np.append(np.subtract(position, tcp.position), turn)
             if np.linalg.norm(off[:3]) < _ARRIVED[0] and abs(off[3]) < _ARRIVED[1]:
                 return
             yield self.move(_GAIN * off, grip, hand)
@@ -394,8 +400,11 @@ class TaskEnv(RigEnv):
                         at = (distance + AREA * (2 * x - 1), AREA * (2 * y - 1), (GRASP_HEIGHT, HEIGHT)[z])
                         for turn in (-_TURN, _TURN):
                             hand.reach(at, turn, "the work area")
-                above = (distance, 0.0, HEIGHT)
-                starts = {hand.robot.name: hand.reach(above, 0.0, "the work area") for hand in self.hands}
+                aside = (0.0,) if len(self.hands) == 1 else (-_ASIDE, _ASIDE)
+                starts = {
+                    hand.robot.name: hand.reach((distance + x, 0.0, HEIGHT), 0.0, "the work area")
+                    for hand, x in zip(self.hands, aside, strict=True)
+                }
                 return np.array([distance, 0.0]), starts
             except CommandError as failed:
                 error = failed
