@@ -423,7 +423,7 @@ class TaskEnv(RigEnv):
         """
         model = {"model": robot or "panda"} if not isinstance(robot, Mapping) else dict(robot)
         view = {"target": [-0.1, 0, 0.7], "distance": 0.85, "yaw_deg": 60, "pitch_deg": -30}
-        streams = ["color", "depth"] if depth else ["color"]
+        streams = ["color", "depth"]
         picture = {"model": "pinhole", "look_at": view, "streams": streams, "output": {"width": 256, "height": 256}}
         table = {"name": "table", "size": [1.5, 1, 0.05]}
         bases = (_BASE, _BASE @ Pose.from_rpy((_APART, 0.0, 0.0), (0.0, 0.0, math.pi)))
@@ -433,7 +433,8 @@ class TaskEnv(RigEnv):
             | model
             for name, base in zip(self.arms, bases, strict=False)
         }
-        entries = [dict(entry) for entry in self.objects if not (depth and entry.get("collision") is False)]
+        unseen = {"visible": False} if depth else {}
+        entries = [dict(entry) | (unseen if entry.get("collision") is False else {}) for entry in self.objects]
         return {
             "robots": robots,
             "cameras": {"scene": picture} if camera else {},
