@@ -104,4 +104,4 @@ def verdicts(states: int) -> Table:
 def run(quick: bool) -> Iterator[Table]:
     """Yield the tables."""
     yield verdicts(1 if quick else 100)
-    yield scores(ENGINES[:1] if quick else ENGINES, 1 if quick else 20, 1 if quick else 5)
+    yield scores(ENGINES[:1] if quick else ENGINES, 1 if quick else 20, 1 if quick else 3)

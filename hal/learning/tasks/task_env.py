@@ -181,6 +181,8 @@ class TaskEnv(RigEnv):
             for hand in self.hands:
                 hand.check_gripper(self.width)
             self._judge = DepthJudge(self, self.objects) if by_depth else None
+            if self._judge is not None:
+                self._cameras = (self._judge.camera,)  # no other picture is waited for
             if not by_depth and not stands_in_world(self.rig, self.robot):
                 raise CommandError("judge='truth' is for simulated arms; use judge='depth'", code="bad_judge")
             self.centre, self._above = self._find_centre(_DISTANCES if distance is None else (distance,))
@@ -313,7 +315,7 @@ class TaskEnv(RigEnv):
             self._check_reach(name, pose)
         there = set(self.rig.world.bodies) if self.rig.has_world else set()
         world = {name: self.robot.base @ pose for name, pose in self.poses.items() if name in there}
-        self._track, self._grips = [], [OPEN] * len(self.hands)
+        self._track, self._grips, self.hidden = [], [OPEN] * len(self.hands), set()
         seen, info = super().reset(options={"q": self._above, "poses": world})
         info.pop("poses", None)
         if self.hidden:

@@ -1,0 +1,67 @@
+"""A task with a name on the emulated FR3 and Franka Hand: judged by a depth picture, not by a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hal
+
+from .franka_kit import Emulator
+
+gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]'")
+pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
+
+import hal.gym  # noqa: E402  # registers the tasks
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+CUBE = "{name: cube, shape: box, half_extents: [0.025, 0.025, 0.025], mass: 0.2, rgba: [0.85, 0.2, 0.2, 1.0]}"
+VIEW = "{target: [-0.1, 0, 0.7], distance: 0.85, yaw_deg: 60, pitch_deg: -30}"
+STEPS = 100
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    with Emulator("--lockstep", hand=True) as robot:  # it waits for a set-point that is late, as on a busy machine
+        overrides = (
+            f"robots.arm.real.host={robot.host}",
+            "robots.arm.gripper.enabled=true",
+            f"objects=[floor, table, {CUBE}]",
+            f"cameras.scene.look_at={VIEW}",
+        )
+        options: dict[str, Any] = {"rig": "franka_emulator", "sim": False, "unattended": True, "overrides": overrides}
+        env = gymnasium.make("hal/PickCube-v0", max_episode_steps=STEPS, **options)
+        yield env
+        env.close()
+
+
+def test_an_arm_whose_hand_does_not_carry_the_cube_has_not_solved_the_task_at_its_end(env: Any) -> None:
+    seen, info = env.reset(seed=3)
+    task = env.unwrapped
+    assert env.observation_space.contains(seen)
+    truth = task.robot.base.inverse() @ task.rig.world.pose("cube")
+    assert seen["object_cube"][:3] == pytest.approx(truth.position, abs=0.008)
+    solution, moved, steps = task.solve(), 0.0, 0
+    start, truncated = seen["tcp"][:3], False
+    while not truncated:
+        seen, reward, terminated, truncated, info = env.step(next(solution, task.move(np.zeros(4), -1.0)))
+        moved, steps = max(moved, float(np.linalg.norm(seen["tcp"][:3] - start))), steps + 1
+        assert (terminated, info["success"], reward < 0.0) == (False, False, True)
+        assert "stopped" not in info
+    assert steps == STEPS
+    assert moved > 0.08
+
+
+def test_depth_says_that_a_cube_is_at_its_goal_and_that_one_is_missing(env: Any) -> None:
+    cube = hal.Pose([0.5, 0.05, 0.025])
+    still = env.unwrapped.move(np.zeros(4), -1.0)
+    env.reset(options={"poses": {"cube": cube, "goal": cube}})
+    assert env.step(still)[-1]["success"] is True
+    env.reset(options={"poses": {"cube": cube, "goal": hal.Pose([0.5, 0.05, 0.06])}})
+    assert env.step(still)[-1]["success"] is False
+    with pytest.raises(hal.CommandError, match="no camera sees cube"):
+        env.reset(options={"poses": {"cube": hal.Pose([0.6, 0.0, -0.6])}})
