@@ -17,10 +17,11 @@ pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot
 
 import hal.gym  # noqa: E402  # registers the tasks
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
 
 CUBE = "{name: cube, shape: box, half_extents: [0.025, 0.025, 0.025], mass: 0.2, rgba: [0.85, 0.2, 0.2, 1.0]}"
-VIEW = "{target: [-0.1, 0, 0.7], distance: 0.85, yaw_deg: 60, pitch_deg: -30}"
+VIEW = "look_at: {target: [-0.1, 0, 0.7], distance: 0.85, yaw_deg: 60, pitch_deg: -30}"
+CAMERA = f"{{sim: true, model: pinhole, streams: [color, depth], output: {{width: 256, height: 256}}, {VIEW}}}"
 STEPS = 100
 
 
@@ -31,9 +32,10 @@ def env() -> Iterator[Any]:
             f"robots.arm.real.host={robot.host}",
             "robots.arm.gripper.enabled=true",
             f"objects=[floor, table, {CUBE}]",
-            f"cameras.scene.look_at={VIEW}",
+            f"cameras={{scene: {CAMERA}}}",
         )
         options: dict[str, Any] = {"rig": "franka_emulator", "sim": False, "unattended": True, "overrides": overrides}
+        options |= {"rate_hz": 10.0}
         env = gymnasium.make("hal/PickCube-v0", max_episode_steps=STEPS, **options)
         yield env
         env.close()

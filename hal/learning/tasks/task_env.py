@@ -108,6 +108,7 @@ class TaskEnv(RigEnv):
         judge: ``truth`` or ``depth``: where the poses of the objects come from. None for ``truth`` in simulation.
         distance: Distance of the middle of the work area from the arm's base, m; None for the greatest, up to 0.5 m, at
             which the arm reaches all of it.
+        rate_hz: Steps per second; less for a real arm whose stops say that commands came too late.
         overrides: Changes of the rig file, ``key=value``.
         deadman: As for :class:`.RigEnv`: a real arm needs it, or ``unattended=True``.
         unattended: Let a real arm move without a dead-man.
@@ -130,8 +131,6 @@ class TaskEnv(RigEnv):
     """Link of an object whose pose is observed, where that is not the object's own: name -> link."""
     width: ClassVar[float] = 0.0
     """Width of the widest object that the fingers grasp, m."""
-    rate_hz: ClassVar[float] = 20.0
-    """Steps per second."""
 
     def __init__(
         self,
@@ -143,6 +142,7 @@ class TaskEnv(RigEnv):
         reward_type: RewardType = "dense",
         judge: Judge | None = None,
         distance: float | None = None,
+        rate_hz: float = 20.0,
         overrides: tuple[str, ...] = (),
         deadman: Callable[[Rig], Deadman] | None = None,
         unattended: bool = False,
@@ -162,7 +162,7 @@ class TaskEnv(RigEnv):
             robots=self._choose_robots(robot if rig is not None else None),
             action="twist",
             objects=names,
-            rate_hz=self.rate_hz,
+            rate_hz=rate_hz,
             cameras=None if by_depth or render_mode else [],
         )
         super().__init__(
@@ -241,13 +241,13 @@ class TaskEnv(RigEnv):
         return self.hands[0].holds(name)
 
     def speed(self, name: str) -> float:
-        """Return the speed of an object, m/s; of one that a camera sees, its mean of half a second."""
+        """Return the speed of an object, m/s; of one that a camera sees, its mean of 10 steps."""
         if self._judge is None:
             return float(np.linalg.norm(self.rig.world.velocity(name)[0]))
         if len(self._track) < 2:
             return math.inf
         moved = self._track[0][name].distance(self._track[-1][name])[0]
-        return float(moved) * self.rate_hz / (len(self._track) - 1)
+        return float(moved) * self.settings.rate_hz / (len(self._track) - 1)
 
     def draw(self, height: float) -> Pose:
         """Return a random pose in the work area at a height over the table, m, turned by up to 45 degrees."""
@@ -447,7 +447,19 @@ class TaskEnv(RigEnv):
 
 def _check_arguments(task: type[TaskEnv], unknown: Mapping[str, Any], **choices: tuple[Any, Any]) -> None:
     """Raise CommandError for an unknown argument, or a value that is none of those allowed."""
-    known = ("robot", "rig", "sim", "engine", "reward_type", "judge", "distance", "overrides", "deadman", "unattended")
+    known = (
+        "robot",
+        "rig",
+        "sim",
+        "engine",
+        "reward_type",
+        "judge",
+        "distance",
+        "rate_hz",
+        "overrides",
+        "deadman",
+        "unattended",
+    )
     for name in unknown:
         near = get_close_matches(name, known, 1)
         advice = f"did you mean {near[0]}=?" if near else f"its arguments: {', '.join(known)}"
