@@ -1,7 +1,7 @@
 """``RigEnv`` in lock-step beside PyBullet by hand, and many worlds in processes and threads.
 
 Goals: 0.55 of PyBullet by hand without a camera, 4 times its renderer with two of 256x256, and 1.8 times as many steps
-on two cores as on one. The scripted solution of each task succeeds with 19 of 20 seeds on each engine.
+on two cores as on one.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-from hal.gym import RigEnv, TaskEnv, make_vec
-from hal.learning.tasks import TASKS
+from hal.gym import EnvSettings, RigEnv, make_vec
 
 from .kit import ENGINES, Table, median, median_ratio, per_second, run_in_turns, sum_of_programs
 from .lock_step import CONFIG, POLICY_HZ, by_hand
 
 PATHS = (
     "hal/learning/gym.py",
-    "hal/learning/tasks",
+    "hal/learning/spaces.py",
     "hal/learning/vector.py",
     "hal/servo",
     "hal/host",
@@ -39,7 +38,7 @@ Step = Callable[[], None]
 
 def make(engine: str = "auto", cameras: bool = False) -> RigEnv:
     """Return one environment in lock-step."""
-    return RigEnv(CONFIG, sim=True, engine=engine, rate_hz=POLICY_HZ, overrides=() if cameras else BARE)
+    return RigEnv(CONFIG, EnvSettings(rate_hz=POLICY_HZ), sim=True, engine=engine, overrides=() if cameras else BARE)
 
 
 def stepping(env: RigEnv | gymnasium.vector.VectorEnv) -> Step:
@@ -93,7 +92,7 @@ def memory(processes: Iterable[int]) -> float:
 def many_worlds(engine: str, worlds: int, seconds: float, rounds: int) -> Table:
     """Return steps/s of all worlds together, those of ways that make many of them beside one RigEnv."""
     one, threaded = make(engine), [make(engine) for _ in range(worlds)]
-    vector = make_vec(CONFIG, worlds, sim=True, engine=engine, rate_hz=POLICY_HZ, overrides=BARE)
+    vector = make_vec(partial(make, engine), worlds)
     asynchronous = gymnasium.vector.AsyncVectorEnv([partial(make, engine)] * worlds, context="spawn")
     steps = [stepping(env) for env in threaded]
     with ThreadPoolExecutor(CORES) as pool:
@@ -125,35 +124,6 @@ def many_worlds(engine: str, worlds: int, seconds: float, rounds: int) -> Table:
     return table
 
 
-def run_episode(env: gymnasium.Env, seed: int, scripted: bool) -> tuple[float, bool]:
-    """Return the sum of the rewards of one episode with scripted or random actions, and whether it succeeded."""
-    env.reset(seed=seed)
-    env.action_space.seed(seed)
-    task = env.unwrapped
-    assert isinstance(task, TaskEnv)
-    total = 0.0
-    for action in task.solve() if scripted else (env.action_space.sample() for _ in itertools.count()):
-        _, reward, terminated, truncated, info = env.step(action)
-        total += float(reward)
-        if terminated or truncated:
-            break
-    return total, info["success"]
-
-
-def tasks(engines: Iterable[str], episodes: int) -> Table:
-    """Return the mean sum of dense rewards, and the successes, of random and of scripted actions."""
-    names = ("", "random return", "random successes", "scripted return", "scripted successes")
-    table = Table(f"tasks, {episodes} seeds each", names)
-    for name, engine in itertools.product(TASKS, engines):
-        env, row = gymnasium.make(f"hal/{name}-v0", engine=engine), []
-        for scripted in (False, True):
-            totals, done = zip(*(run_episode(env, seed, scripted) for seed in range(episodes)), strict=True)
-            row += [float(np.mean(totals)), sum(done)]
-        table.add(f"{name}, {engine}", *row)
-        env.close()
-    return table
-
-
 def run(quick: bool) -> Iterator[Table]:
     """Yield the tables."""
     seconds, rounds, worlds = (0.1, 1, 2) if quick else (4.0, 5, 16)
@@ -162,4 +132,3 @@ def run(quick: bool) -> Iterator[Table]:
     engines = ENGINES[:1] if quick else ENGINES
     for engine in engines:
         yield many_worlds(engine, worlds, seconds, rounds)
-    yield tasks(engines, 1 if quick else 20)

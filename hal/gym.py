@@ -5,7 +5,8 @@ Tasks with a name are registered by the import: ``gymnasium.make("hal/PickCube-v
 
 from __future__ import annotations
 
-from .learning.gym import ActionKind, ObservationDict, RigEnv
+from .learning.gym import EnvSettings, RigEnv
+from .learning.spaces import ActionKind, ObservationDict
 from .learning.tasks.task_env import CLOSED, GRASP_HEIGHT, OPEN, TaskEnv, closeness, cube_entry, goal_entry
 from .learning.vector import RigVectorEnv, make_vec
 
@@ -14,6 +15,7 @@ __all__ = [
     "GRASP_HEIGHT",
     "OPEN",
     "ActionKind",
+    "EnvSettings",
     "ObservationDict",
     "RigEnv",
     "RigVectorEnv",

@@ -1,8 +1,8 @@
 """A rig as a Gymnasium environment, the same for the simulated and for the real arm.
 
-    from hal.gym import RigEnv
+    from hal.gym import EnvSettings, RigEnv
 
-    env = RigEnv("panda_table", action="twist", rate_hz=20)
+    env = RigEnv("panda_table", EnvSettings(action="twist", rate_hz=20))
     observation, info = env.reset(seed=1)
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
@@ -12,10 +12,11 @@ and watchdog as teleoperation. Needs ``pip install 'robot-hal[gym]'``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +31,24 @@ from ..geometry import Pose, apply_rotation
 from ..observation import Observation
 from ..rig import Rig, open_rig
 from ..robot import Robot
-from ..specs import CameraSpec
-from ..types import STREAMS
 from .episode import reset_scene, stands_in_world
 
 try:
     import gymnasium
-    from gymnasium import spaces
     from gymnasium.spaces import Box, Dict
+
+    from .spaces import (
+        IN_JOINTS,
+        ActionKind,
+        ObservationDict,
+        action_names,
+        action_space,
+        entry_key,
+        list_streams,
+        numbers_and_pictures,
+        observation_space,
+        pose_array,
+    )
 except ImportError as error:
     text = "RigEnv needs gymnasium; install with: pip install 'robot-hal[gym]'"
     raise DriverMissing(text, name="gymnasium") from error
@@ -45,176 +56,12 @@ except ImportError as error:
 if TYPE_CHECKING:
     from ..servo.controllers import Controller
 
-__all__ = [
-    "ActionKind",
-    "RigEnv",
-    "ObservationDict",
-    "action_space",
-    "pose_array",
-    "entry_key",
-    "numbers_and_pictures",
-    "observation_space",
-]
-
-ActionKind = Literal["joint", "tcp_delta", "twist", "velocity", "torque"]
-"""``joint``: positions (n,), rad; more than 0.1 rad from the set-point they are clipped, and ``info["clipped"]`` is
-True. ``tcp_delta``: translation (m) and rotation vector (rad) of the tcp's goal in this step, along the base's axes.
-``twist``: velocity of the tcp, m/s and rad/s, along the base's axes. ``velocity``: joint velocities (n,), rad/s.
-``torque``: joint torques (n,), Nm, on top of those that carry the arm's weight (see :class:`hal.JointTorque`). With a
-gripper one more number follows, 0 (open) to 1 (closed)."""
-
-ObservationDict = dict[str, NDArray[Any]]
-
-
-def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, speeds: tuple[float, float]) -> spaces.Box:
-    """Return the box of actions: the numbers of each arm, one arm after the other.
-
-    Args:
-        robots: The arms.
-        kind: Kind of action.
-        rate_hz: Steps per second.
-        speeds: Greatest speeds of the tcp, m/s and rad/s.
-
-    Raises:
-        CommandError: An unknown ``kind`` (code ``unknown_action``).
-        NotSupported: Torques, for an arm that has no limits for them (``no_torque_limits``).
-    """
-    linear, angular = speeds
-    low: list[float] = []
-    high: list[float] = []
-    for robot in robots:
-        if kind == "joint":
-            low += robot.limits.lower
-            high += robot.limits.upper
-        elif kind in ("velocity", "torque"):
-            most = _find_limits(robot, kind)
-            low += [-value for value in most]
-            high += most
-        elif kind in ("tcp_delta", "twist"):
-            share = 1.0 / rate_hz if kind == "tcp_delta" else 1.0
-            most = [linear * share] * 3 + [angular * share] * 3
-            low += [-value for value in most]
-            high += most
-        else:
-            known = ", ".join(get_args(ActionKind))
-            raise CommandError(f"action must be one of {known}, not {kind!r}", code="unknown_action")
-        if robot.gripper is not None:
-            low.append(0.0)
-            high.append(1.0)
-    return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
-
-
-def _find_limits(robot: Robot, kind: ActionKind) -> list[float]:
-    """Return the greatest joint velocities of a session (n,), rad/s, or the greatest torques (n,), Nm."""
-    if kind == "velocity":
-        return [robot.spec.speed * value for value in robot.limits.velocity]
-    if robot.limits.torque is None:
-        raise NotSupported(f"{robot.name}: its model has no limits.torque, Nm per joint", code="no_torque_limits")
-    return list(robot.limits.torque)
-
-
-_IN_JOINTS = ("joint", "velocity", "torque")
-"""Kinds of action with one number for each joint."""
-
-
-def action_names(robots: Sequence[Robot], kind: ActionKind, several: bool) -> tuple[str, ...]:
-    """Return the name of each number of an action; with ``several`` arms the arm's name leads, as in recordings."""
-    names: list[str] = []
-    for robot in robots:
-        own = [
-            *(robot.joints if kind in _IN_JOINTS else _TCP_NAMES),
-            *(["gripper"] if robot.gripper is not None else []),
-        ]
-        names += [f"{robot.name}.{name}" if several else name for name in own]
-    return tuple(names)
-
-
-POINTS = "points"
-"""Name of the stream of points, which follows from the depth."""
-_TCP_NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
-
-
-def observation_space(
-    robots: Mapping[str, Robot], cameras: Iterable[Camera], streams: Collection[str], objects: Collection[str]
-) -> spaces.Dict:
-    """Return a box for each entry of :func:`numbers_and_pictures`, and for the pose of each of ``objects``.
-
-    Raises:
-        CommandError: Two entries would have the same key (code ``duplicate_name``).
-    """
-
-    def make_box(size: int) -> spaces.Box:
-        return spaces.Box(-np.inf, np.inf, (size,), np.float64)
-
-    parts: list[tuple[str, spaces.Space[Any]]] = []
-    for lead, robot in robots.items():
-        sizes = {"q": robot.n, "dq": robot.n, "tcp": 7} | ({"gripper": 1} if robot.gripper is not None else {})
-        parts += [(lead + name, make_box(size)) for name, size in sizes.items()]
-    for camera in cameras:
-        found = [stream for stream in streams if stream in _list_streams(camera.spec)]
-        parts += [(entry_key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
-    parts += [(entry_key("object", name), make_box(7)) for name in objects]
-    keys = [name for name, _ in parts]
-    if twice := sorted({name for name in keys if keys.count(name) > 1}):
-        raise CommandError(
-            f"two parts of the observation would be called {', '.join(twice)}: rename an arm, a camera or an object",
-            code="duplicate_name",
-        )
-    return spaces.Dict(dict(parts))
-
-
-def _picture_space(camera: CameraSpec, stream: str) -> spaces.Box:
-    """Return the box of one camera's pictures: (H, W, 3) colour and points, (H, W, 1) anything else."""
-    size = (camera.height, camera.width)
-    if stream == POINTS:
-        return spaces.Box(-np.inf, np.inf, (*size, 3), np.float32)
-    kind = STREAMS[stream]
-    highest = camera.depth_max if kind.highest is None else kind.highest
-    return spaces.Box(kind.lowest, highest, (*size, *(kind.shape or (1,))), np.dtype(kind.dtype).type)
-
-
-def numbers_and_pictures(
-    observation: Observation, robots: Mapping[str, Robot], cameras: Collection[str], streams: Collection[str]
-) -> ObservationDict:
-    """Return the entries of an observation: the arms, their grippers and these streams of these cameras.
-
-    ``robots`` maps what leads the names of an arm's entries to the arm. Points are in the base frame of the first.
-    """
-    shown: ObservationDict = {}
-    for lead, robot in robots.items():
-        state = observation.robots[robot.name]
-        shown |= {f"{lead}q": np.array(state.q), f"{lead}dq": np.array(state.dq), f"{lead}tcp": pose_array(state.tcp)}
-        if robot.gripper is not None:
-            shown[f"{lead}gripper"] = np.array([observation.grippers[robot.name].width])
-    for name in cameras:
-        frame = observation.cameras[name].frame
-        for stream in streams:
-            if stream != POINTS:
-                picture = getattr(frame, stream)
-            else:
-                picture = None if frame.depth is None else frame.point_image(next(iter(robots.values())).base)
-            if picture is not None:
-                shown[entry_key(name, stream)] = picture if picture.ndim == 3 else picture[..., None]
-    return shown
-
-
-def _list_streams(camera: CameraSpec) -> tuple[str, ...]:
-    """Return the streams of a camera that can be observed: its own, and points where it has depth."""
-    return (*camera.streams, POINTS) if "depth" in camera.streams else tuple(camera.streams)
-
-
-def entry_key(*parts: str) -> str:
-    """Return the key of an entry: an identifier, because PyTorch modules that are named by keys allow no dots."""
-    return "_".join(parts).replace("-", "_")
-
-
-def pose_array(pose: Pose) -> NDArray[np.float64]:
-    """Return a pose as (7,): position in m, and quaternion xyzw."""
-    return np.concatenate([pose.position, pose.orientation])
-
+__all__ = ["EnvSettings", "RigEnv"]
 
 Result = tuple[ObservationDict, dict[str, Any]]
 
+simulated_only = False
+"""Whether this process refuses real arms, as those of :func:`hal.gym.make_vec` do."""
 _MAX_LEAD = (0.03, 0.12)
 """Distance of a goal ahead of the set-point above which it is reset, m and rad."""
 _MAX_STEP = 0.999 * FIRST_STEP_ANGLE  # the servo refuses more, also after rounding
@@ -228,7 +75,7 @@ class _EnvArm:
         self.control: Control | None = None
         self.goal = Pose()
         self.clipped = False
-        self.size = (robot.n if kind in _IN_JOINTS else 6) + int(robot.gripper is not None)
+        self.size = (robot.n if kind in IN_JOINTS else 6) + int(robot.gripper is not None)
         """Count of numbers in an action."""
         self._kind = kind
         self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
@@ -263,22 +110,49 @@ class _EnvArm:
         return CartesianTarget(self.goal), grip
 
 
-def _check_lists(**arguments: Collection[str] | None) -> None:
-    """Raise CommandError for one name in the place of a list of them."""
-    for argument, names in arguments.items():
-        if isinstance(names, str):
-            raise CommandError(f"{argument} must be a list of names: [{names!r}]", code="not_a_list")
+@dataclass(frozen=True, kw_only=True)
+class EnvSettings:
+    """How a :class:`RigEnv` acts and observes.
 
+    Raises:
+        CommandError: A value is wrong.
+    """
 
-def _check_functions(**arguments: object) -> None:
-    """Raise CommandError for anything that is neither None nor a function."""
-    for argument, function in arguments.items():
-        if function is not None and not callable(function):
-            raise CommandError(f"{argument} must be a function, not {function!r}", code="not_callable")
+    robots: str | Sequence[str] | None = None
+    """Name of the arm, or a list of the names of several; None for the rig's first."""
+    action: ActionKind = "joint"
+    """Kind of action, see :data:`ActionKind`."""
+    controller: Controller | None = None
+    """What makes the arms follow: :class:`hal.Position` by default, :class:`hal.JointImpedance` or
+    :class:`hal.OperationalSpace`. Not for torques."""
+    cameras: Collection[str] | None = None
+    """Names of the observed cameras; None for all."""
+    streams: Collection[str] | None = None
+    """Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``, ``segmentation`` and
+    ``points``; None for colour and depth."""
+    objects: Collection[str] = ()
+    """Names of the objects of the simulated world whose poses are observed."""
+    rate_hz: float = 20.0
+    """Steps per second."""
+    max_steps: int | None = None
+    """Steps after which an episode is truncated; None for no limit."""
+    speeds: tuple[float, float] = (0.25, 1.0)
+    """Greatest speeds of the tcp for ``twist`` and, per step, for ``tcp_delta``: m/s and rad/s."""
+
+    def __post_init__(self) -> None:
+        for name in ("cameras", "streams", "objects"):
+            if isinstance(value := getattr(self, name), str):
+                raise CommandError(f"{name} must be a list of names: [{value!r}]", code="not_a_list")
+        if self.action not in get_args(ActionKind):
+            known = ", ".join(get_args(ActionKind))
+            raise CommandError(f"action must be one of {known}, not {self.action!r}", code="unknown_action")
+        number("rate_hz", self.rate_hz, "Hz", least=0.0, above=True)
 
 
 class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """An arm of a rig, or several, with their grippers and cameras, as a Gymnasium environment.
+
+    Your own environment is a subclass with :meth:`reward`, :meth:`success` and, if the scene varies, :meth:`arrange`.
 
     Observations are a dict: ``q`` and ``dq`` (n,), rad and rad/s; ``tcp`` (7,), position in m and quaternion xyzw in
     the arm's base frame; ``gripper`` (1,), width in m; per camera, of the streams that it has, ``<name>_color`` (H, W,
@@ -288,39 +162,23 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     ``object_<name>`` (7,), its pose in the world. A dash in a name becomes an underscore. :attr:`observation` is the
     complete record behind it, with every stamp; ``info["elapsed"]`` is its time since the reset, s.
 
-    With ``robots`` an action has the numbers of each arm, one arm after the other (:attr:`action_names`), and the arm's
-    name leads its entries of the observation: ``left_q``. A stop of one arm ends the episode for all.
+    With a list of ``robots`` an action has the numbers of each arm, one arm after the other (:attr:`action_names`), and
+    the arm's name leads its entries of the observation: ``left_q``. A stop of one arm ends the episode for all.
 
     ``step`` sends the action, lets one period pass and waits for an observation that was taken after that, so that no
     observation is returned twice. If the arm is stopped (releasing the dead-man is not a stop), the episode is
     truncated and ``info["stopped"]`` has the reason.
 
     Args:
-        config: The rig's configuration, as for :func:`hal.open`.
+        rig: The rig's configuration, as for :func:`hal.open`.
+        settings: How the environment acts and observes; None for the class's :attr:`settings`.
         sim: True for simulated drivers, as for :func:`hal.open`.
         driver: Driver of all devices, as for :func:`hal.open`.
         engine: Engine of the simulated world, as for :func:`hal.open`.
-        robot: Name of the arm; None for the rig's first.
-        robots: Names of several arms, instead of ``robot``.
-        action: Kind of action, see :data:`ActionKind`.
-        controller: What makes the arm follow: :class:`hal.Position` by default, :class:`hal.JointImpedance` or
-            :class:`hal.OperationalSpace`. Not for torques.
-        cameras: Names of the observed cameras; None for all.
-        streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``,
-            ``segmentation`` and ``points``; None for colour and depth.
-        objects: Names of the objects of the simulated world whose poses are observed.
-        rate_hz: Steps per second.
-        max_steps: Steps after which an episode is truncated; None for no limit.
-        speeds: Greatest speeds of the tcp for ``twist`` and, per step, for ``tcp_delta``: m/s and rad/s.
-        reward: Called as ``reward(env, observation)`` after each step; None for a reward of 0.
-        terminated: Called as ``terminated(env, observation)`` after each step.
-        on_reset: Called as ``on_reset(env, options)`` after the reset and before the first observation: time for
-            the operator to arrange a real bench, or for a task to move objects with ``env.rig.world`` and
-            ``env.np_random``.
+        overrides: Changes of the configuration, ``key=value``.
         deadman: Makes the dead-man from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``;
             something that really moves needs it, or ``unattended=True``.
         unattended: Let a real arm move without a dead-man.
-        overrides: Changes of the configuration, ``key=value``.
         render_mode: None or ``rgb_array``.
 
     Raises:
@@ -331,59 +189,52 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # Gymnasium's own name and type
+    settings: EnvSettings = EnvSettings()
+    """How the environment acts and observes."""
 
     def __init__(
         self,
-        config: str | Path | Mapping[str, Any] = "panda_table",
+        rig: str | Path | Mapping[str, Any] = "panda_table",
+        settings: EnvSettings | None = None,
         *,
         sim: bool | None = None,
         driver: str | None = None,
         engine: str | None = None,
-        robot: str | None = None,
-        robots: Sequence[str] | None = None,
-        action: ActionKind = "joint",
-        controller: Controller | None = None,
-        cameras: Collection[str] | None = None,
-        streams: Collection[str] | None = None,
-        objects: Collection[str] = (),
-        rate_hz: float = 20.0,
-        max_steps: int | None = None,
-        speeds: tuple[float, float] = (0.25, 1.0),
-        reward: Callable[[RigEnv, Observation], float] | None = None,
-        terminated: Callable[[RigEnv, Observation], bool] | None = None,
-        on_reset: Callable[[RigEnv, dict[str, Any]], None] | None = None,
+        overrides: tuple[str, ...] = (),
         deadman: Callable[[Rig], Deadman] | None = None,
         unattended: bool = False,
-        overrides: tuple[str, ...] = (),
         render_mode: str | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             text = f"render_mode {render_mode!r}: use rgb_array, the first camera's picture"
             raise NotSupported(text, code="render_mode")
-        _check_lists(cameras=cameras, streams=streams, objects=objects)
-        _check_functions(reward=reward, terminated=terminated, on_reset=on_reset, deadman=deadman)
-        rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
-        self.render_mode = render_mode
-        self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
-        self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
-        self._unattended, self._controller = unattended, controller
-        self.rig = self._open(config, deadman is not None, sim=sim, driver=driver, engine=engine, overrides=overrides)
+        if deadman is not None and not callable(deadman):
+            raise CommandError(f"deadman must be a function of the rig, not {deadman!r}", code="not_callable")
+        self.render_mode, self._unattended = render_mode, unattended
+        if settings is not None:
+            self.settings = settings
+        chosen = self.settings
+        self.rig = self._open(rig, deadman is not None, sim=sim, driver=driver, engine=engine, overrides=overrides)
         try:
-            chosen_robots = _choose_robots(self.rig, robot, robots)
-            self.robot: Robot = chosen_robots[0]
+            robots = _choose_robots(self.rig, chosen.robots)
+            several = not isinstance(chosen.robots, str | None)
+            self.robot: Robot = robots[0]
             """The arm; the first of several."""
-            self._arms = tuple(_EnvArm(arm, action) for arm in chosen_robots)
-            self._leads = {"" if robots is None else entry_key(arm.name, ""): arm for arm in chosen_robots}
-            self.action_names = action_names(chosen_robots, action, robots is not None)
-            """Name of each number of an action; with ``robots`` after the arm's name, as in recordings."""
+            self._arms = tuple(_EnvArm(arm, chosen.action) for arm in robots)
+            self._leads = {entry_key(arm.name, "") if several else "": arm for arm in robots}
+            self.action_names = action_names(robots, chosen.action, several)
+            """Name of each number of an action; with several arms after the arm's name, as in recordings."""
             self._deadman = deadman(self.rig) if deadman is not None else None
-            self._cameras = tuple(self.rig.cameras) if cameras is None else tuple(cameras)
-            self._objects = _check_objects(objects, self.rig)
-            chosen = [self.rig.cameras[name] for name in self._cameras]
-            self._streams = ("color", "depth") if streams is None else _check_streams(streams, chosen)
-            self.action_space: Box = action_space(chosen_robots, action, rate_hz, speeds)  # type: ignore[assignment]
-            self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
-                self._leads, chosen, self._streams, self._objects
+            self._cameras = tuple(self.rig.cameras if chosen.cameras is None else chosen.cameras)
+            self._objects = _check_objects(chosen.objects, self.rig)
+            cameras = [self.rig.cameras[name] for name in self._cameras]
+            streams = chosen.streams
+            self._streams = ("color", "depth") if streams is None else _check_streams(streams, cameras)
+            self.action_space: Box = action_space(  # type: ignore[assignment]  # invariant in their types
+                robots, chosen.action, chosen.rate_hz, chosen.speeds
+            )
+            self.observation_space: Dict = observation_space(  # type: ignore[assignment]
+                self._leads, cameras, self._streams, self._objects
             )
             self._check_sessions()
         except BaseException:
@@ -393,6 +244,25 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.observation: Observation | None = None
         """The complete record behind the newest observation."""
 
+    # What a subclass overrides.
+
+    def reward(self) -> float:
+        """Return the reward of a step; called after each, when :attr:`observation` is new."""
+        return 0.0
+
+    def success(self) -> bool:
+        """Return whether the task is done, which ends the episode; called after each step, before :meth:`reward`."""
+        return False
+
+    def arrange(self, options: dict[str, Any]) -> None:
+        """Arrange the scene; called in each reset before the first observation, with the reset's ``options``.
+
+        It is the time for the operator to arrange a real bench, or to move simulated objects with ``self.rig.world``
+        and ``self.np_random``.
+        """
+
+    # Gymnasium's interface.
+
     def _check_sessions(self) -> None:
         """Check the arguments of the arms' control sessions, and open none. Raises CommandError."""
         from ..servo.controllers import Position
@@ -400,19 +270,24 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         # Whether a pad can be trusted is checked at the reset: it may be asleep.
         free = self._unattended or self._deadman is not None
         for arm in self._arms:
-            checked = arm.robot.control(rate_hz=self._rate, unattended=free, controller=self._controller)
-            if self._kind == "torque" and checked.controller != Position():
+            checked = arm.robot.control(
+                rate_hz=self.settings.rate_hz, unattended=free, controller=self.settings.controller
+            )
+            if self.settings.action == "torque" and checked.controller != Position():
                 raise CommandError("action='torque' takes no controller", code="torques_by_controller")
 
     @staticmethod
-    def _open(config: str | Path | Mapping[str, Any], pads: bool, **options: Any) -> Rig:
+    def _open(rig: str | Path | Mapping[str, Any], pads: bool, **options: Any) -> Rig:
         """Open the rig, in lock-step if nothing real is in it; ``options`` are those of :func:`hal.open`."""
         from ..config import load
 
-        plan = load(config, **options).resolve()
-        attended = any(arm.attended for arm in plan.robots)
+        plan = load(rig, **options).resolve()
+        attended = [arm.name for arm in plan.robots if arm.attended]
+        if simulated_only and (attended or pads):
+            what = f"{', '.join(attended)} really moves; pass sim=True" if attended else "deadman= is for real arms"
+            raise NotSupported(f"make_vec: {what}", code="not_simulated")
         clock = None if attended or pads else "lock_step"
-        return open_rig(config, clock=clock, pad=None if pads else "none", **options)
+        return open_rig(rig, clock=clock, pad=None if pads else "none", **options)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Result:
         """Reset the scene; a real arm drives to its start, and opens its gripper.
@@ -450,8 +325,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
                 unattended=self._unattended,
             )
         self._place(starts)
-        if self._on_reset is not None:
-            self._on_reset(self, options)
+        self.arrange(options)
         self._open_sessions()
         self.rig.forget_observations()
         observation = self.rig.observe(after=self.rig.clock.now(), cameras=self._cameras)
@@ -475,7 +349,10 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     def _open_sessions(self) -> None:
         for arm in self._arms:
             control = arm.robot.control(
-                deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended, controller=self._controller
+                deadman=self._deadman,
+                rate_hz=self.settings.rate_hz,
+                unattended=self._unattended,
+                controller=self.settings.controller,
             )
             arm.control = control.__enter__()
 
@@ -495,8 +372,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
                 (``bad_action``).
         """
         numbers = np.asarray(action, float)
-        if numbers.shape != self.action_space.shape:
-            raise CommandError(f"an action has shape {self.action_space.shape}, not {numbers.shape}", code="bad_action")
+        if numbers.shape != (count := (sum(arm.size for arm in self._arms),)):
+            raise CommandError(f"an action has shape {count}, not {numbers.shape}", code="bad_action")
         clock = self.rig.clock
         stopped, first = "", 0
         for arm in self._arms:
@@ -510,17 +387,17 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
                 reason = stop.reason if isinstance(stop, MotionStopped) else stop.cause
                 stopped = stopped or (f"{arm.robot.name}: {reason}" if len(self._arms) > 1 else reason)
         now = clock.now()
-        self._due = max(self._due + 1.0 / self._rate, now)  # a late turn is not caught up
+        self._due = max(self._due + 1.0 / self.settings.rate_hz, now)  # a late turn is not caught up
         clock.sleep_until(self._due)
         observation = self.rig.observe(after=self._find_oldest(now), cameras=self._cameras)
         self._steps += 1
-        terminated = self._terminated is not None and bool(self._terminated(self, observation))
-        truncated = bool(stopped) or (self._max_steps is not None and self._steps >= self._max_steps)
+        shown, most = self._observation_dict(observation), self.settings.max_steps
+        terminated, reward = bool(self.success()), float(self.reward())
+        truncated = bool(stopped) or (most is not None and self._steps >= most)
         info = self._info(observation)
         if stopped:
             info["stopped"] = stopped
-        reward = float(self._reward(self, observation)) if self._reward is not None else 0.0
-        return self._observation_dict(observation), reward, terminated, truncated, info
+        return shown, reward, terminated, truncated, info
 
     def _find_oldest(self, sent: float) -> float | None:
         """Return the oldest time of an acceptable picture, s; None in lock-step, where all show the present.
@@ -559,12 +436,14 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             self.rig.close()
 
 
-def _choose_robots(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[Robot]:
-    """Return the arms of an environment. Raises CommandError if both arguments are given, or a name twice."""
+def _choose_robots(rig: Rig, robots: str | Sequence[str] | None) -> list[Robot]:
+    """Return the arms of an environment. Raises CommandError if none is named, or one twice."""
     if robots is None:
-        return [rig.robots[robot] if robot else next(iter(rig.robots.values()))]
-    if robot is not None or isinstance(robots, str) or len(set(robots)) < len(robots) or not robots:
-        raise CommandError("pass robot='left', or robots=['left', 'right']: each arm once", code="bad_robots")
+        return [next(iter(rig.robots.values()))]
+    if isinstance(robots, str):
+        return [rig.robots[robots]]
+    if not robots or len(set(robots)) < len(robots):
+        raise CommandError("robots='left', or robots=['left', 'right']: each arm once", code="bad_robots")
     return [rig.robots[name] for name in robots]
 
 
@@ -579,7 +458,7 @@ def _check_objects(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
 
 def _check_streams(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
     """Return the observed streams. Raises NotSupported for one that none of the cameras has."""
-    there = {stream for camera in cameras for stream in _list_streams(camera.spec)}
+    there = {stream for camera in cameras for stream in list_streams(camera.spec)}
     if missing := [stream for stream in streams if stream not in there]:
         message = (
             f"streams=: no observed camera has {', '.join(missing)}; they have: {', '.join(sorted(there)) or 'none'}"

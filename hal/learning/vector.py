@@ -1,12 +1,12 @@
-"""Many copies of one simulated rig as a Gymnasium ``VectorEnv``, spread over a few processes.
+"""Many copies of one simulated environment as a Gymnasium ``VectorEnv``, spread over a few processes.
 
     from hal.gym import make_vec
 
-    envs = make_vec("panda_table", 16, sim=True, action="twist", overrides=("cameras={}",))
+    envs = make_vec("hal/PickCube-v0", 16)
     observations, infos = envs.reset(seed=1)
     observations, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
 
-Each process (:class:`~hal.host.process.Child`) holds several :class:`.RigEnv` and steps them one after the other: a
+Each process (:class:`~hal.host.process.Child`) holds several environments and steps them one after the other: a
 servo in Python keeps one core busy, and a process costs more memory than a world. What every step takes and returns is
 in memory that all share, the rest in messages. The processes end with the program, however it ends.
 """
@@ -24,20 +24,20 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
+import gymnasium
 import numpy as np
 from gymnasium.spaces import Dict, Space
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ..config import load
 from ..errors import CommandError, ConnectionLost, HalError, NotSupported
 from ..host.process import START_TIMEOUT, Channel, Child, SharedMemory, pack_error, serve, unpack_error
-from .gym import ObservationDict, RigEnv, entry_key
+from . import gym
+from .spaces import ObservationDict, entry_key
 
 __all__ = ["RigVectorEnv", "make_vec"]
 
@@ -48,34 +48,32 @@ _AWAKE = 5e-4
 """A process that made a step awaits the next one so long without sleeping, s: waking up takes a tenth of a ms."""
 _IDLE = 0.5
 """Longest sleep of a process, s, before it checks that the program is there."""
-_PLAN = ("sim", "driver", "engine", "overrides")
-"""Arguments of RigEnv that choose the rig."""
 
 VectorResult = tuple[ObservationDict, dict[str, Any]]
 VectorStep = tuple[ObservationDict, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
 def make_vec(
-    config: str | Path | Mapping[str, Any] = "panda_table",
+    env: str | Callable[..., gymnasium.Env[Any, Any]],
     num_envs: int = 1,
     *,
     processes: int | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     **options: Any,
 ) -> RigVectorEnv:
-    """Return copies of a simulated rig that step together, as a Gymnasium ``VectorEnv``.
+    """Return copies of a simulated environment that step together, as a Gymnasium ``VectorEnv``.
 
-    World ``k`` of ``reset(seed=s)`` is, to the bit, a :class:`.RigEnv` with the seed ``s + k``.
+    World ``k`` of ``reset(seed=s)`` is, to the bit, the environment with the seed ``s + k``.
 
     Args:
-        config: The rig's configuration, as for :func:`hal.open`.
+        env: Name of a registered environment such as ``hal/PickCube-v0``, or :class:`.RigEnv`, or a class of yours. A
+            class that no module has is copied into the processes by cloudpickle.
         num_envs: Number of worlds.
         processes: Number of processes that share them; None for one per core.
         autoreset_mode: What follows the end of an episode, as in Gymnasium: ``NextStep`` resets that world in the next
             step, whose action it ignores; ``SameStep`` resets it at once, and the end is in ``infos["final_obs"]`` and
             ``infos["final_info"]``; ``Disabled`` leaves it to ``reset(options={"reset_mask": ...})``.
-        options: Arguments of :class:`.RigEnv`. Functions (``reward``, ``terminated``, ``on_reset``) are copied into the
-            processes by cloudpickle, so they share no variables with this program.
+        options: Arguments of the environment, for example ``robot="fr3"``.
 
     Raises:
         CommandError: An argument is wrong.
@@ -91,12 +89,14 @@ def make_vec(
     modes = [mode.value for mode in AutoresetMode]
     if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
         raise CommandError(f"autoreset_mode is one of {', '.join(modes)}, not {autoreset_mode!r}", code="bad_autoreset")
-    if wrong := sorted({"deadman", "unattended"} & options.keys()):
-        raise CommandError(f"make_vec: {', '.join(wrong)}= is for real arms; use RigEnv", code="not_simulated")
-    plan = load(config, **{name: options[name] for name in _PLAN if name in options}).resolve()
-    if real := [arm.name for arm in plan.robots if arm.attended]:
-        raise NotSupported(f"make_vec: {', '.join(real)} really moves; pass sim=True", code="not_simulated")
-    make = partial(RigEnv, config, **options)
+    if isinstance(env, str):
+        try:
+            make = partial(gymnasium.make, gymnasium.spec(env), disable_env_checker=True, **options)
+        except gymnasium.error.Error as error:
+            text = f"{error} A class of environments is passed itself: make_vec(RigEnv, 4, rig={env!r})"
+            raise CommandError(text, code="unknown_environment") from None
+    else:
+        make = partial(env, **options)
     return RigVectorEnv(make, int(num_envs), int(min(num_envs, processes)), AutoresetMode(autoreset_mode))
 
 
@@ -119,7 +119,7 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
     """
 
     def __init__(
-        self, make: Callable[[], RigEnv], num_envs: int, processes: int, autoreset_mode: AutoresetMode
+        self, make: Callable[[], gymnasium.Env[Any, Any]], num_envs: int, processes: int, autoreset_mode: AutoresetMode
     ) -> None:
         self.num_envs = num_envs
         self._parts = [slice(*ends) for ends in pairwise(num_envs * k // processes for k in range(processes + 1))]
@@ -322,7 +322,7 @@ class _Worlds:
     """The worlds of one process."""
 
     def __init__(
-        self, envs: Sequence[RigEnv], first: int, count: int, mode: AutoresetMode, memory: SharedMemory
+        self, envs: Sequence[gymnasium.Env[Any, Any]], first: int, count: int, mode: AutoresetMode, memory: SharedMemory
     ) -> None:
         self._envs, self._first, self._mode = envs, first, mode
         self._order = list(range(len(envs)))
@@ -333,6 +333,7 @@ class _Worlds:
     def attach(self) -> None:
         """Map the memory of the observations, which has its size now."""
         env = self._envs[0]
+        assert isinstance(env.observation_space, Dict)
         dtypes = _WorldRecords.dtypes(env.observation_space, env.action_space)
         self._records = _WorldRecords(self._memory, dtypes, self._count)
 
@@ -421,15 +422,19 @@ class _Worlds:
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
     """Run the worlds of one process, until the program closes them or is gone."""
-    make: Callable[[], RigEnv] = _unpack(config["make"])
+    gym.simulated_only = True
+    make: Callable[[], gymnasium.Env[Any, Any]] = _unpack(config["make"])
     with ExitStack() as closing:
         envs = []
         for _ in range(config["first"], config["end"]):
             envs.append(env := make())
             closing.callback(env.close)
         worlds = _Worlds(envs, config["first"], config["count"], AutoresetMode(config["mode"]), memories[0])
-        rendered = entry_key(env._cameras[0], "color") if env._cameras else ""
-        rendered = rendered if rendered in env.observation_space.spaces else ""
+        if not isinstance(env.observation_space, Dict):
+            text = f"make_vec: observations are a dict, not {env.observation_space}"
+            raise NotSupported(f"{text}; wrap the VectorEnv instead", code="no_dict")
+        shown = entry_key(next(iter(getattr(env.unwrapped, "_cameras", ())), ""), "color")
+        rendered = shown if shown in env.observation_space.spaces else ""
         spaces = (env.observation_space, env.action_space, env.metadata, env.render_mode, rendered)
         channel.send({"ready": _pack(spaces)})
 

@@ -9,8 +9,15 @@ import gymnasium
 
 __all__ = ["TASKS"]
 
-TASKS = ("PickCube", "PushCube", "StackCubes")
-"""Names of the tasks: ``hal/<name>-v0`` in Gymnasium."""
+TASKS = {
+    "PickCube": ("pick_cube", 200),
+    "PushCube": ("push_cube", 200),
+    "StackCubes": ("stack_cubes", 300),
+    "PegInHole": ("peg_in_hole", 300),
+    "OpenDrawer": ("open_drawer", 200),
+    "HandOver": ("hand_over", 400),
+}
+"""Module and steps of an episode of each task; ``hal/<name>-v0`` in Gymnasium."""
 
-for _name, _place, _steps in zip(TASKS, ("pick_cube", "push_cube", "stack_cubes"), (200, 200, 300), strict=True):
-    gymnasium.register(f"hal/{_name}-v0", f"{__name__}.{_place}:{_name}", max_episode_steps=_steps)
+for _name, (_module, _steps) in TASKS.items():
+    gymnasium.register(f"hal/{_name}-v0", f"{__name__}.{_module}:{_name}", max_episode_steps=_steps)

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...geometry import Pose
-from .task_env import CLOSED, GRASP_HEIGHT, HEIGHT, OPEN, Action, Array, TaskEnv, closeness, cube_entry
+from .hand import Array
+from .task_env import CLOSED, GRASP_HEIGHT, HEIGHT, OPEN, Action, TaskEnv, closeness, cube_entry
 
 __all__ = ["StackCubes"]
 

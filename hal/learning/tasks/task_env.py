@@ -6,30 +6,36 @@ A task is a subclass with its objects, their start poses, a success and a reward
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import ArrayLike, NDArray
 
-from ...errors import CommandError, NotSupported, Unreachable
+from ...deadman import Deadman
+from ...errors import CommandError
 from ...geometry import Pose
 from ...observation import Observation
-from ..gym import ObservationDict, RigEnv, entry_key, pose_array
+from ...rig import Rig
+from ..episode import stands_in_world
+from ..gym import EnvSettings, RigEnv
+from ..spaces import ObservationDict, entry_key, pose_array
+from .by_depth import DepthJudge
+from .hand import GRASP_HEIGHT, UPRIGHT_GAIN, Array, Hand, fold, yaw_of
 
 __all__ = ["CLOSED", "GRASP_HEIGHT", "OPEN", "RewardType", "TaskEnv", "closeness", "cube_entry", "goal_entry"]
 
-Array = NDArray[np.float64]
 Action = NDArray[np.float32]
 RewardType = Literal["dense", "sparse"]
 """``dense``: :meth:`TaskEnv.reward`. ``sparse``: -1 in every step, 0 in that of the success."""
+Judge = Literal["truth", "depth"]
+"""Where the poses of the objects come from: the simulation, or the picture of a camera with depth."""
 
 OPEN, CLOSED = -1.0, 1.0
 """Last number of an action: the fingers."""
-GRASP_HEIGHT = 0.03
-"""Height of the tcp over the table at which fingers grasp what stands on it, m."""
 AREA = 0.1
 """Half the side of the square of the table in which a task takes place, m."""
 HEIGHT = 0.13
@@ -38,20 +44,22 @@ _BASE = Pose((-0.55, 0.0, 0.6))
 """The arm's base in the world, level with the table."""
 _DISTANCES = (0.5, 0.45, 0.4, 0.35, 0.3, 0.25)
 """Distances of the middle of the work area from the base, m; the first at which the arm reaches all of it is taken."""
+_APART = 1.0
+"""Distance of the bases of two arms, m."""
+_ASIDE = 0.15
+"""Distance of the hands of two arms from the middle of the work area at the start, m."""
 _TURN = 0.25 * math.pi
 """Greatest turn of the hand about the vertical, either way, with which the arm must reach all of it, rad."""
-_FREE = 0.01
-"""How much wider than an object the fingers must open, m."""
 _BOUND = 2.0
 """Bound of the positions in an observation, m."""
-_GAIN = 6.0
-"""Velocity of a scripted motion for each metre or radian to its goal, 1/s; also that which keeps the hand upright."""
+_GAIN = UPRIGHT_GAIN
+"""Velocity of a scripted motion for each metre or radian to its goal, 1/s."""
 _LONGEST = 300
 """Most steps of one way of a scripted solution: those of the longest episode."""
 _ARRIVED = (0.004, 0.03)
 """Distance and angle from its goal at which a scripted motion has arrived, m and rad."""
-_STILL = 0.2
-"""Speed of every joint below which the arm is at rest, rad/s."""
+_RECENT = 10
+"""Steps over which the speed of an object that a camera sees is measured."""
 
 
 def cube_entry(name: str, side: float, rgba: tuple[float, float, float, float]) -> dict[str, Any]:
@@ -70,8 +78,8 @@ def closeness(a: ArrayLike, b: ArrayLike) -> float:
     return 1.0 - math.tanh(5.0 * float(np.linalg.norm(np.subtract(a, b))))
 
 
-class TaskEnv(gymnasium.Env[ObservationDict, Action]):
-    """A task on a table for an arm with a gripper whose hand points down. Always simulated, in lock-step.
+class TaskEnv(RigEnv):
+    """A task on a table for an arm with a gripper whose hand points down; for two of them with two :attr:`arms`.
 
     An action is float32 (5,), each number in -1 to 1: the velocity of the tcp along x, y and z of the arm's base (1 is
     0.25 m/s), that of the hand's turn about z (1 is 1 rad/s), and the fingers, from -1 (open) to 1 (closed).
@@ -80,67 +88,113 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
     ``gripper`` (1,) as of :class:`.RigEnv`, and the pose ``object_<name>`` (7,) of each of :attr:`objects`. What is
     outside the bounds of the space is clipped to them.
 
+    With two arms, ``left`` and ``right``, an action has the numbers of the right one after those of the left one, and
+    the arm's name leads its entries. All positions and velocities are in the base frame of the left one.
+
     ``info["success"]`` tells whether the task is done, which ends the episode (``terminated``). Rewards should be 0 at
     most: an agent that is paid for every step learns to put the end off.
 
+    On a real or emulated arm (``rig=``, ``sim=False``) the poses of the objects are found in the picture of a camera
+    with depth. The arm drives to its start in each reset, and a person puts the objects into the work area.
+
     Args:
-        robot: Name of a model with a gripper (``hal list robots``), or a dict: its entry in a rig file.
+        robot: Name of a model with a gripper (``hal list robots``), or a dict: its entry in a rig file. With ``rig``
+            the name of an arm in that file; None for its first.
+        rig: A rig file (as for :func:`hal.open`) whose arm and camera are used, in place of the task's own table. The
+            table must be level with the arm's base.
+        sim: As for :func:`hal.open`; only with ``rig``.
         engine: Engine of the simulation, as for :func:`hal.open`.
         reward_type: ``dense`` or ``sparse``.
+        judge: ``truth`` or ``depth``: where the poses of the objects come from. None for ``truth`` in simulation.
         distance: Distance of the middle of the work area from the arm's base, m; None for the greatest, up to 0.5 m, at
             which the arm reaches all of it.
+        rate_hz: Steps per second; less for a real arm whose stops say that commands came too late.
+        overrides: Changes of the rig file, ``key=value``.
+        deadman: As for :class:`.RigEnv`: a real arm needs it, or ``unattended=True``.
+        unattended: Let a real arm move without a dead-man.
         render_mode: None, or ``rgb_array``: the picture of a camera beside the table.
 
     Raises:
         ConfigError: There is no such model or engine.
-        NotSupported: The arm has no gripper (code ``no_gripper``), or its fingers open less than :attr:`width`
-            requires (``too_wide``).
+        NotSupported: The arm has no gripper (code ``no_gripper``), its fingers open less than :attr:`width` requires
+            (``too_wide``), no camera has depth (``no_depth``), or depth cannot judge this task (``not_by_depth``).
         CommandError: The arm does not reach all of the work area (``out_of_reach``), or an argument is wrong.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}  # type: ignore[misc]
 
+    arms: ClassVar[tuple[str, ...]] = ("arm",)
+    """Names of the arms; the second one faces the first, beyond the work area."""
     objects: ClassVar[tuple[Mapping[str, Any], ...]] = ()
     """What is on the table: entries of a rig file, as :func:`cube_entry` and :func:`goal_entry` return them."""
+    links: ClassVar[Mapping[str, str]] = {}
+    """Link of an object whose pose is observed, where that is not the object's own: name -> link."""
     width: ClassVar[float] = 0.0
     """Width of the widest object that the fingers grasp, m."""
-    rate_hz: ClassVar[float] = 20.0
-    """Steps per second."""
 
     def __init__(
         self,
-        robot: str | Mapping[str, Any] = "panda",
+        robot: str | Mapping[str, Any] | None = None,
         *,
+        rig: str | Path | Mapping[str, Any] | None = None,
+        sim: bool | None = None,
         engine: str | None = None,
         reward_type: RewardType = "dense",
+        judge: Judge | None = None,
         distance: float | None = None,
+        rate_hz: float = 20.0,
+        overrides: tuple[str, ...] = (),
+        deadman: Callable[[Rig], Deadman] | None = None,
+        unattended: bool = False,
         render_mode: str | None = None,
+        **unknown: Any,
     ) -> None:
-        if reward_type not in get_args(RewardType):
-            raise CommandError(f"reward_type is dense or sparse, not {reward_type!r}", code="bad_reward_type")
-        self.render_mode, self._sparse = render_mode, reward_type == "sparse"
+        _check_arguments(type(self), unknown, reward_type=(reward_type, RewardType), judge=(judge, Judge))
+        self._sparse = reward_type == "sparse"
         self.poses: dict[str, Pose] = {}
-        """Pose of each object in the arm's base frame, at the newest observation."""
-        self.rig_env = RigEnv(
-            _make_rig(robot, self.objects, camera=render_mode is not None),
-            sim=True,
-            engine=engine,
+        """Pose of each object in the arm's base frame, at the newest observation in which it was seen."""
+        self.hidden: set[str] = set()
+        """Objects that the newest picture does not show; while there are any, the task is not done."""
+        by_depth = judge == "depth" or (judge is None and rig is not None and sim is False)
+        names = [] if by_depth else [entry["name"] for entry in self.objects]
+        own = rig is None
+        settings = EnvSettings(
+            robots=self._choose_robots(robot if rig is not None else None),
             action="twist",
-            objects=[entry["name"] for entry in self.objects],
-            rate_hz=self.rate_hz,
+            objects=names,
+            rate_hz=rate_hz,
+            cameras=None if by_depth or render_mode else [],
+        )
+        super().__init__(
+            self._make_rig(robot, camera=by_depth or render_mode is not None, depth=by_depth) if rig is None else rig,
+            settings,
+            sim=True if own else sim,
+            engine=engine,
+            overrides=overrides,
+            deadman=deadman,
+            unattended=unattended,
             render_mode=render_mode,
         )
-        """The environment of the rig beneath; ``rig_env.rig`` is the rig."""
-        self.arm = self.rig_env.robot
         try:
-            self._check_gripper()
-            self.centre, self._start = self._find_centre(_DISTANCES if distance is None else (distance,))
+            self.hands = tuple(Hand(self, arm.robot, self.robot.base) for arm in self._arms)
+            """The arms with their grippers."""
+            for hand in self.hands:
+                hand.check_gripper(self.width)
+            self._judge = DepthJudge(self, self.objects) if by_depth else None
+            if self._judge is not None:
+                self._cameras = (self._judge.camera,)  # no other picture is waited for
+            if not by_depth and not stands_in_world(self.rig, self.robot):
+                raise CommandError("judge='truth' is for simulated arms; use judge='depth'", code="bad_judge")
+            self.centre, self._above = self._find_centre(_DISTANCES if distance is None else (distance,))
             """Middle of the work area (2,) in the arm's base frame, m; it ends :data:`AREA` from there."""
         except BaseException:
-            self.rig_env.close()
+            self.rig.close()
             raise
-        self._most = self.rig_env.action_space.high[[0, 1, 2, 5]].astype(float)
-        self.action_space: Box = Box(-1.0, 1.0, (5,), np.float32)  # type: ignore[assignment]
+        self._most = self.action_space.high[[0, 1, 2, 5]].astype(float)
+        self._grips = [OPEN] * len(self.hands)
+        self._track: list[dict[str, Pose]] = []
+        """The newest poses of the objects, one for each step."""
+        self.action_space: Box = Box(-1.0, 1.0, (5 * len(self.hands),), np.float32)  # type: ignore[assignment]
         self._bounds = self._find_bounds()
         boxes: dict[str, Space[Any]] = {
             name: Box(low, high, dtype=np.float32) for name, (low, high) in self._bounds.items()
@@ -169,58 +223,72 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
 
     @property
     def tcp(self) -> Pose:
-        """Pose of the tcp in the arm's base frame, at the newest observation."""
-        return self._seen.robots[self.arm.name].tcp
+        """Pose of the first arm's tcp at the newest observation."""
+        return self.hands[0].tcp
 
     @property
     def opening(self) -> float:
-        """Distance between the fingers at the newest observation, m."""
-        return self._seen.grippers[self.arm.name].width
+        """Distance between the first arm's fingers at the newest observation, m."""
+        return self.hands[0].opening
 
     @property
     def at_rest(self) -> bool:
-        """Whether the arm was at rest at the newest observation."""
-        return bool(np.abs(self._seen.robots[self.arm.name].dq).max() < _STILL)
+        """Whether all arms were at rest at the newest observation."""
+        return all(hand.at_rest for hand in self.hands)
 
     def holds(self, name: str) -> bool:
-        """Return whether the fingers press on something, and the object is where the fingers are."""
-        near = float(np.linalg.norm(self.poses[name].position - self.tcp.position)) < GRASP_HEIGHT
-        return near and bool(self._seen.grippers[self.arm.name].grasped)
+        """Return whether the first arm's fingers press on something, and the object is where the fingers are."""
+        return self.hands[0].holds(name)
 
     def speed(self, name: str) -> float:
-        """Return the speed of an object, m/s."""
-        return float(np.linalg.norm(self.rig_env.rig.world.velocity(name)[0]))
+        """Return the speed of an object, m/s; of one that a camera sees, its mean of 10 steps."""
+        if self._judge is None:
+            return float(np.linalg.norm(self.rig.world.velocity(name)[0]))
+        if len(self._track) < 2:
+            return math.inf
+        moved = self._track[0][name].distance(self._track[-1][name])[0]
+        return float(moved) * self.settings.rate_hz / (len(self._track) - 1)
 
     def draw(self, height: float) -> Pose:
         """Return a random pose in the work area at a height over the table, m, turned by up to 45 degrees."""
         x, y = self.centre + self.np_random.uniform(-AREA, AREA, 2)
         return Pose.from_rpy((x, y, height), (0.0, 0.0, self.np_random.uniform(-_TURN, _TURN)))
 
-    def go(self, position: ArrayLike, yaw: float, grip: float) -> Iterator[Action]:
-        """Yield actions until the tcp is at a position (3,), m, and the hand at a turn about z, rad; at most 15 s."""
+    def go(self, position: ArrayLike, yaw: float, grip: float, hand: int = 0) -> Iterator[Action]:
+        """Yield actions until a tcp is at a position (3,), m, and its hand turned by ``yaw`` about z; at most 15 s.
+
+        A ``yaw`` of 0 is straight ahead for that arm, rad.
+        """
         for _ in range(_LONGEST):
-            off = np.append(np.subtract(position, self.tcp.position), _fold(yaw - self.yaw(self.tcp), 2.0 * math.pi))
+            tcp = self.hands[hand].tcp
+            turn = fold(self.hands[hand].ahead + yaw - yaw_of(tcp), 2.0 * math.pi)
+            off = np.append(np.subtract(position, tcp.position), turn)
             if np.linalg.norm(off[:3]) < _ARRIVED[0] and abs(off[3]) < _ARRIVED[1]:
                 return
-            yield self.move(_GAIN * off, grip)
+            yield self.move(_GAIN * off, grip, hand)
 
-    def move(self, velocity: ArrayLike, grip: float) -> Action:
-        """Return the action for a velocity (4,): of the tcp along x, y and z, m/s, and of its turn about z, rad/s."""
-        return np.append(np.clip(np.divide(velocity, self._most), -1.0, 1.0), grip).astype(np.float32)
+    def move(self, velocity: ArrayLike, grip: float, hand: int = 0) -> Action:
+        """Return the action for a velocity (4,): of a tcp along x, y and z, m/s, and of its turn about z, rad/s.
 
-    def wait(self, steps: int, grip: float) -> Iterator[Action]:
+        Other hands stay where they are.
+        """
+        action = np.zeros((len(self.hands), 5))
+        action[:, 4] = self._grips
+        action[hand] = np.append(np.clip(np.divide(velocity, self._most), -1.0, 1.0), grip)
+        return action.ravel().astype(np.float32)
+
+    def wait(self, steps: int, grip: float, hand: int = 0) -> Iterator[Action]:
         """Yield actions that move only the fingers."""
         for _ in range(steps):
-            yield self.move(np.zeros(4), grip)
+            yield self.move(np.zeros(4), grip, hand)
 
     def yaw(self, pose: Pose) -> float:
         """Return the angle of a pose's x axis about z, rad."""
-        x, y = pose.matrix()[:2, 0]
-        return math.atan2(y, x)
+        return yaw_of(pose)
 
     def grasp_yaw(self, cube: Pose) -> float:
         """Return the turn of the hand, within 45 degrees of straight ahead, whose fingers lie along sides of a cube."""
-        return _fold(self.yaw(cube), 0.5 * math.pi)
+        return fold(yaw_of(cube), 0.5 * math.pi)
 
     # Gymnasium's interface.
 
@@ -229,22 +297,31 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
     ) -> tuple[ObservationDict, dict[str, Any]]:
         """Place the arm over the middle of the work area, and the objects.
 
+        On a real bench the objects are where they were put.
+
         Args:
             seed: Seed of ``np_random``; the same seed gives the same episode, to the bit. None continues its sequence.
             options: ``poses``: name of an object -> its :class:`~hal.geometry.Pose` in the arm's base frame, instead
                 of a random one.
 
         Raises:
-            CommandError: The arm does not reach an object (code ``out_of_reach``).
+            CommandError: The arm does not reach an object (code ``out_of_reach``), or no camera sees one
+                (``not_seen``).
         """
-        super().reset(seed=seed)
-        poses = self.place() | dict((options or {}).get("poses", {}))
-        for name, pose in poses.items():
-            self._reach(pose.position, 0.0, name)
-        world = {name: self.arm.base @ pose for name, pose in poses.items()}
-        seen, info = self.rig_env.reset(options={"q": self._start, "poses": world})
-        del info["poses"]
-        return self._observe(seen), info | {"success": False}
+        if seed is not None:
+            super(RigEnv, self).reset(seed=seed)  # the poses are drawn before the scene is reset
+        self.poses = self.place() | dict((options or {}).get("poses", {}))
+        for name, pose in self.poses.items():
+            self._check_reach(name, pose)
+        there = set(self.rig.world.bodies) if self.rig.has_world else set()
+        world = {name: self.robot.base @ pose for name, pose in self.poses.items() if name in there}
+        self._track, self._grips, self.hidden = [], [OPEN] * len(self.hands), set()
+        seen, info = super().reset(options={"q": self._above, "poses": world})
+        info.pop("poses", None)
+        if self.hidden:
+            text = f"no camera sees {' and '.join(sorted(self.hidden))}: put it into the work area"
+            raise CommandError(f"{text}, before {self.centre.round(2)} m from the arm's base", code="not_seen")
+        return seen, info | {"success": False}
 
     def step(self, action: Action) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
         """Send an action and wait one period; returns Gymnasium's five values.
@@ -254,116 +331,140 @@ class TaskEnv(gymnasium.Env[ObservationDict, Action]):
                 (``bad_action``).
         """
         numbers = np.asarray(action, float)
-        if numbers.shape != (5,):
-            raise CommandError(f"an action has shape (5,), not {numbers.shape}", code="bad_action")
-        numbers = np.clip(numbers, -1.0, 1.0)
-        upright = np.cross(self.tcp.matrix()[:3, 2], (0.0, 0.0, -1.0))[:2]  # what turns the tcp's z axis down again
-        velocity = numbers[:4] * self._most
-        twist = [*velocity[:3], *(_GAIN * upright).clip(-self._most[3], self._most[3]), velocity[3]]
-        seen, _, _, truncated, info = self.rig_env.step(np.array([*twist, 0.5 * (numbers[4] + 1.0)], np.float32))
-        shown = self._observe(seen)
-        done = bool(self.success())
-        reward = float(done) - 1.0 if self._sparse else float(self.reward())
-        return shown, reward, done, truncated, info | {"success": done}
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return the picture of the camera beside the table (H, W, 3)."""
-        return self.rig_env.render()
-
-    def close(self) -> None:
-        """Close the rig. Idempotent."""
-        self.rig_env.close()
+        if numbers.shape != self.action_space.shape:
+            text = f"an action has shape {self.action_space.shape}, not {numbers.shape}"
+            raise CommandError(text, code="bad_action")
+        twists: list[float] = []
+        self._grips = np.clip(numbers[4::5], -1.0, 1.0).tolist()
+        for hand, own in zip(self.hands, np.clip(numbers, -1.0, 1.0).reshape(-1, 5), strict=True):
+            twists += [*hand.twist(own[:4] * self._most, self._most), 0.5 * (own[4] + 1.0)]
+        shown, reward, done, truncated, info = super().step(np.array(twists, np.float32))
+        done = done and not self.hidden
+        return shown, float(done) - 1.0 if self._sparse else reward, done, truncated, info | {"success": done}
 
     # Details.
 
-    @property
-    def _seen(self) -> Observation:
-        if self.rig_env.observation is None:
-            raise CommandError("call reset before step", code="not_reset")
-        return self.rig_env.observation
-
-    def _observe(self, seen: ObservationDict) -> ObservationDict:
-        """Return an observation from one of the rig, and note the poses of the objects."""
-        to_base = self.arm.base.inverse()
-        shown = {name: seen[name] for name in ("q", "dq", "tcp", "gripper")}
+    def _observation_dict(self, observation: Observation) -> ObservationDict:
+        """Return an observation, and note the poses of the objects."""
+        seen = super()._observation_dict(observation)
+        base = self.robot.base
+        shown: ObservationDict = {}
+        for lead, hand in zip(self._leads, self.hands, strict=True):
+            shown |= {lead + name: seen[lead + name] for name in ("q", "dq", "gripper")}
+            shown[lead + "tcp"] = pose_array(hand.tcp)
+        if self._judge is not None:
+            found = self._judge.find(observation)
+            self.hidden = self._judge.names - found.keys()
+            self.poses |= found
+        else:
+            to_base = base.inverse()
+            for name in self._objects:
+                key, link = entry_key("object", name), self.links.get(name)
+                pose = self.rig.world.pose(name, link) if link else Pose(seen[key][:3], seen[key][3:])
+                self.poses[name] = to_base @ pose
+        self._track = [*self._track[-_RECENT:], dict(self.poses)]
         for entry in self.objects:
-            key = entry_key("object", entry["name"])
-            pose = to_base @ Pose(seen[key][:3], seen[key][3:])
-            self.poses[entry["name"]], shown[key] = pose, pose_array(pose)
-        return {name: np.clip(value, *self._bounds[name]).astype(np.float32) for name, value in shown.items()}
+            shown[entry_key("object", entry["name"])] = pose_array(self.poses[entry["name"]])
+        return {name: np.clip(shown[name], *bounds).astype(np.float32) for name, bounds in self._bounds.items()}
 
     def _find_bounds(self) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Return the lower and upper bounds of each entry of an observation."""
-        limits, gripper = self.arm.limits, self.arm.gripper
-        assert gripper is not None
         pose = np.array([_BOUND] * 3 + [1.0] * 4, np.float32)
-        speed, width = np.array(limits.velocity, np.float32), np.array([gripper.width_max], np.float32)
-        bounds = {
-            "q": (np.array(limits.lower, np.float32), np.array(limits.upper, np.float32)),
-            "dq": (-speed, speed),
-            "tcp": (-pose, pose),
-            "gripper": (0.0 * width, width),
-        }
+        bounds: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+        for lead, hand in zip(self._leads, self.hands, strict=True):
+            limits = hand.robot.limits
+            speed, width = np.array(limits.velocity, np.float32), np.array([hand.gripper.width_max], np.float32)
+            bounds |= {
+                lead + "q": (np.array(limits.lower, np.float32), np.array(limits.upper, np.float32)),
+                lead + "dq": (-speed, speed),
+                lead + "tcp": (-pose, pose),
+                lead + "gripper": (0.0 * width, width),
+            }
         return bounds | {entry_key("object", entry["name"]): (-pose, pose) for entry in self.objects}
 
-    def _check_gripper(self) -> None:
-        """Check that the arm has a gripper that opens far enough. Raises NotSupported."""
-        gripper, task = self.arm.gripper, type(self).__name__
-        if gripper is None:
-            text = f"robot=: this arm has no gripper, which {task} needs; `hal list robots` shows those that have one"
-            raise NotSupported(text, code="no_gripper")
-        if self.width and gripper.width_max < self.width + _FREE:
-            text = f"robot=: its fingers open to {gripper.width_max:.3f} m; {task} needs {self.width + _FREE:.3f} m"
-            raise NotSupported(text, code="too_wide")
+    def _check_reach(self, name: str, pose: Pose) -> None:
+        """Check that an arm reaches an object. Raises CommandError."""
+        for hand in self.hands:
+            try:
+                hand.reach(pose.position, 0.0, name)
+                return
+            except CommandError as error:
+                failed = error
+        raise failed
 
-    def _find_centre(self, distances: tuple[float, ...]) -> tuple[Array, Array]:
-        """Return the middle of the work area (2,), m, and the joint positions (n,) over it, rad."""
+    def _find_centre(self, distances: tuple[float, ...]) -> tuple[Array, dict[str, Array]]:
+        """Return the middle of the work area (2,), m, and each arm's joint positions (n,) over it, rad."""
         error = CommandError("")
         for distance in distances:
             try:
-                for x, y, z in np.ndindex(2, 2, 2):
-                    at = (distance + AREA * (2 * x - 1), AREA * (2 * y - 1), (GRASP_HEIGHT, HEIGHT)[z])
-                    for turn in (-_TURN, _TURN):
-                        self._reach(at, turn, "the work area")
-                return np.array([distance, 0.0]), self._reach((distance, 0.0, HEIGHT), 0.0, "the work area")
+                for hand in self.hands:
+                    for x, y, z in np.ndindex(2, 2, 2):
+                        at = (distance + AREA * (2 * x - 1), AREA * (2 * y - 1), (GRASP_HEIGHT, HEIGHT)[z])
+                        for turn in (-_TURN, _TURN):
+                            hand.reach(at, turn, "the work area")
+                aside = (0.0,) if len(self.hands) == 1 else (-_ASIDE, _ASIDE)
+                starts = {
+                    hand.robot.name: hand.reach((distance + x, 0.0, HEIGHT), 0.0, "the work area")
+                    for hand, x in zip(self.hands, aside, strict=True)
+                }
+                return np.array([distance, 0.0]), starts
             except CommandError as failed:
                 error = failed
         raise error
 
-    def _reach(self, position: ArrayLike, yaw: float, what: str) -> Array:
-        """Return joint positions (n,), rad, with the hand over or around something. Raises CommandError."""
-        x, y, z = np.asarray(position, float)
-        try:
-            q = self.arm.ik(Pose.from_rpy((x, y, max(z, GRASP_HEIGHT)), (math.pi, 0.0, yaw)), self.arm.home)
-            touched = self.arm.collisions.check(q)
-        except Unreachable:
-            why = "the arm does not get there"
-        else:
-            if not touched:
-                return q
-            why = str(touched[0])
-        text = (
-            f"{what} is out of reach: with the hand pointing down at {x:.2f}, {y:.2f}, {z:.2f} m from the base, {why}"
-        )
-        raise CommandError(f"{text}; choose another robot, place or distance=", code="out_of_reach")
+    def _choose_robots(self, robot: str | Mapping[str, Any] | None) -> str | tuple[str, ...] | None:
+        """Return the names of the arms in the rig, as :class:`.EnvSettings` takes them; None for the first."""
+        if len(self.arms) > 1:
+            return self.arms
+        return robot if isinstance(robot, str) else None
+
+    def _make_rig(self, robot: str | Mapping[str, Any] | None, *, camera: bool, depth: bool) -> dict[str, Any]:
+        """Return the rig file of a task: the arms at a table with the objects and, if wanted, a camera.
+
+        A camera that judges must not see goals, which are not on a real table.
+        """
+        model = {"model": robot or "panda"} if not isinstance(robot, Mapping) else dict(robot)
+        view = {"target": [-0.1, 0, 0.7], "distance": 0.85, "yaw_deg": 60, "pitch_deg": -30}
+        streams = ["color", "depth"]
+        picture = {"model": "pinhole", "look_at": view, "streams": streams, "output": {"width": 256, "height": 256}}
+        table = {"name": "table", "size": [1.5, 1, 0.05]}
+        bases = (_BASE, _BASE @ Pose.from_rpy((_APART, 0.0, 0.0), (0.0, 0.0, math.pi)))
+        robots = {
+            name: {"base": {"position": base.position.tolist(), "orientation": base.orientation.tolist()}}
+            | {"workspace": {"table_height": 0.01}}
+            | model
+            for name, base in zip(self.arms, bases, strict=False)
+        }
+        unseen = {"visible": False} if depth else {}
+        entries = [dict(entry) | (unseen if entry.get("collision") is False else {}) for entry in self.objects]
+        return {
+            "robots": robots,
+            "cameras": {"scene": picture} if camera else {},
+            "objects": ["floor", "table", *entries],
+            "collisions": {"boxes": [table | {"position": [0, 0, 0.5645]}]},  # 10.5 mm lower, for the margin of 10 mm
+        }
 
 
-def _make_rig(
-    robot: str | Mapping[str, Any], objects: tuple[Mapping[str, Any], ...], *, camera: bool
-) -> dict[str, Any]:
-    """Return the rig file of a task: the arm at a table with the objects and, if wanted, a camera."""
-    arm = {"model": robot} if isinstance(robot, str) else dict(robot)
-    view = {"target": [-0.1, 0, 0.7], "distance": 0.85, "yaw_deg": 60, "pitch_deg": -30}
-    picture = {"model": "pinhole", "look_at": view, "streams": ["color"], "output": {"width": 256, "height": 256}}
-    base, table = {"position": _BASE.position.tolist()}, {"name": "table", "size": [1.5, 1, 0.05]}
-    return {
-        "robots": {"arm": {"base": base, "workspace": {"table_height": 0.01}} | arm},
-        "cameras": {"scene": picture} if camera else {},
-        "objects": ["floor", "table", *(dict(entry) for entry in objects)],
-        "collisions": {"boxes": [table | {"position": [0, 0, 0.5645]}]},  # 10.5 mm lower, for the margin of 10 mm
-    }
-
-
-def _fold(angle: float, period: float) -> float:
-    """Return an angle plus a multiple of ``period``, at most half a period from 0, rad."""
-    return angle - period * round(angle / period)
+def _check_arguments(task: type[TaskEnv], unknown: Mapping[str, Any], **choices: tuple[Any, Any]) -> None:
+    """Raise CommandError for an unknown argument, or a value that is none of those allowed."""
+    known = (
+        "robot",
+        "rig",
+        "sim",
+        "engine",
+        "reward_type",
+        "judge",
+        "distance",
+        "rate_hz",
+        "overrides",
+        "deadman",
+        "unattended",
+    )
+    for name in unknown:
+        near = get_close_matches(name, known, 1)
+        advice = f"did you mean {near[0]}=?" if near else f"its arguments: {', '.join(known)}"
+        raise CommandError(f"{task.__name__} has no argument {name!r}; {advice}", code="unknown_argument")
+    for name, (value, kind) in choices.items():
+        if value is not None and value not in get_args(kind):
+            text = f"{name} is {' or '.join(get_args(kind))}, not {value!r}"
+            raise CommandError(text, code=f"bad_{name}")

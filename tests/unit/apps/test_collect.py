@@ -22,8 +22,8 @@ from hal.apps import collect
 from hal.apps._collecting import CollectRun
 from hal.camera import Camera
 from hal.drivers.mock.gamepad import MockPad
+from hal.gym import EnvSettings, RigEnv
 from hal.learning.episode import reset_scene
-from hal.learning.gym import RigEnv
 from hal.recording import Dataset, Episode, Recorder
 from hal.views import Console, DrivingView, Listen, RecordingView
 
@@ -145,7 +145,7 @@ def test_the_seed_of_an_episode_gives_an_environment_the_same_start(call: Collec
     assert call("--pad", pad, "--episodes", 1, "--seed", 5) == 0
     (episode,) = episodes()
     assert episode.info["seed"] == seed_of(0, seed=5)
-    env = RigEnv("panda_table", sim=True, rate_hz=30, overrides=("cameras={}",))
+    env = RigEnv("panda_table", EnvSettings(rate_hz=30), sim=True, overrides=("cameras={}",))
     try:
         _, info = env.reset(seed=episode.info["seed"])
     finally:

@@ -7,6 +7,7 @@ import importlib
 import os
 import re
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from hal.learning.gym import RigEnv  # noqa: E402
+from hal.gym import EnvSettings, RigEnv  # noqa: E402
 
 BARE = ("cameras={}",)
 
@@ -34,13 +35,15 @@ def test_a_missing_gymnasium_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("argument", ["cameras", "streams", "objects"])
 def test_one_name_in_place_of_a_list_is_refused(argument: str) -> None:
     with raises_code(hal.CommandError, "not_a_list"):
-        RigEnv("panda_table", **{argument: "cube"})  # type: ignore[arg-type]  # the mistake
+        EnvSettings(**{argument: "cube"})  # type: ignore[arg-type]  # the mistake
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*")
 @pytest.mark.parametrize("action", ["joint", "tcp_delta", "twist"])
 def test_it_passes_gymnasiums_own_checks(action: str) -> None:
-    env = RigEnv("panda_table", sim=True, action=action, max_steps=50, overrides=("cameras.scene.output.width=64",))
+    env = RigEnv(
+        "panda_table", EnvSettings(action=action, max_steps=50), sim=True, overrides=("cameras.scene.output.width=64",)
+    )
     try:
         check_env(env, skip_render_check=True)
     finally:
@@ -52,7 +55,7 @@ STREAMS = "cameras.scene.streams=[color, depth, infrared, segmentation]"
 
 def test_keys_are_identifiers_and_every_stream_can_be_chosen() -> None:
     streams = ["color", "infrared", "segmentation", "points"]
-    env = RigEnv("panda_table", sim=True, streams=streams, objects=["cube"], overrides=(STREAMS,))
+    env = RigEnv("panda_table", EnvSettings(streams=streams, objects=["cube"]), sim=True, overrides=(STREAMS,))
     try:
         seen, _ = env.reset()
         assert env.observation_space.contains(seen)
@@ -79,7 +82,7 @@ def test_keys_are_identifiers_and_every_stream_can_be_chosen() -> None:
         env.close()
     for wrong in (["color", "thermal"], ["segmentation"]):
         with raises_code(hal.NotSupported, "unknown_stream"):
-            RigEnv("panda_table", driver="mock", streams=wrong)
+            RigEnv("panda_table", EnvSettings(streams=wrong), driver="mock")
 
 
 def test_two_parts_of_an_observation_never_share_a_key() -> None:
@@ -96,7 +99,9 @@ if os.environ.get("HAL_SB3") == "1":  # not by default: PyTorch may bring gigaby
         from stable_baselines3.common import env_checker
 
         small = ("cameras.scene.output={width: 64, height: 64}", "cameras.wrist.output={width: 64, height: 64}")
-        env = RigEnv("panda_table", sim=True, action="tcp_delta", objects=["cube"], max_steps=50, overrides=small)
+        env = RigEnv(
+            "panda_table", EnvSettings(action="tcp_delta", objects=["cube"], max_steps=50), sim=True, overrides=small
+        )
         try:
             env_checker.check_env(env)
             PPO("MultiInputPolicy", env, n_steps=100, batch_size=50).learn(500)
@@ -106,7 +111,7 @@ if os.environ.get("HAL_SB3") == "1":  # not by default: PyTorch may bring gigaby
 
 
 def run(steps: int) -> bytes:
-    env = RigEnv("panda_table", sim=True, action="joint", overrides=BARE)
+    env = RigEnv("panda_table", EnvSettings(action="joint"), sim=True, overrides=BARE)
     try:
         seen, _ = env.reset(seed=7)
         env.action_space.seed(7)
@@ -125,7 +130,7 @@ def test_the_same_seed_and_actions_give_the_same_states_to_the_bit() -> None:
 
 
 def test_an_action_moves_the_arm_by_its_values() -> None:
-    env = RigEnv("panda_table", sim=True, action="tcp_delta", overrides=BARE)
+    env = RigEnv("panda_table", EnvSettings(action="tcp_delta"), sim=True, overrides=BARE)
     try:
         before, _ = env.reset()
         for _ in range(20):
@@ -139,7 +144,14 @@ def test_an_action_moves_the_arm_by_its_values() -> None:
 
 def test_a_reset_restores_poses_or_sets_the_given_ones() -> None:
     calls = []
-    env = RigEnv("panda_table", sim=True, action="twist", overrides=BARE, on_reset=lambda env, o: calls.append(o))
+
+    class Arranged(RigEnv):
+        settings = EnvSettings(action="twist")
+
+        def arrange(self, options: dict[str, Any]) -> None:
+            calls.append(options)
+
+    env = Arranged("panda_table", sim=True, overrides=BARE)
     try:
         first, info = env.reset(seed=1)
         assert info["elapsed"] == 0.0
@@ -162,7 +174,7 @@ def test_joints_move_by_velocities_with_a_controller_or_by_bare_torques(
     action: str, mode: hal.ControlMode | None
 ) -> None:
     controller = hal.JointImpedance() if mode is not None else None
-    env = RigEnv("panda_table", sim=True, action=action, controller=controller, overrides=BARE)
+    env = RigEnv("panda_table", EnvSettings(action=action, controller=controller), sim=True, overrides=BARE)
     try:
         first, _ = env.reset(seed=1)
         assert env.action_names[:1] == ("panda_joint1",)
@@ -177,7 +189,7 @@ def test_joints_move_by_velocities_with_a_controller_or_by_bare_torques(
 
 
 def test_a_stop_at_a_limit_names_the_limit() -> None:
-    env = RigEnv("panda_table", driver="mock", action="torque", overrides=BARE)
+    env = RigEnv("panda_table", EnvSettings(action="torque"), driver="mock", overrides=BARE)
     try:
         env.reset()
         for _ in range(100):
@@ -194,10 +206,11 @@ RANGES = "objects.3={file: duck, random: {x: [0.2, 0.3], y: [-0.3, 0.3], yaw_deg
 
 @pytest.mark.slow
 def test_the_same_seed_starts_at_the_same_poses_to_the_bit_and_without_one_come_the_next() -> None:
-    def used(env: RigEnv, options: dict[str, object]) -> None:
-        env.np_random.uniform(size=1 if env.observation is None else 5)
+    class Drawing(RigEnv):
+        def arrange(self, options: dict[str, Any]) -> None:
+            self.np_random.uniform(size=1 if self.observation is None else 5)
 
-    env = RigEnv("panda_table", sim=True, action="twist", overrides=(*BARE, RANGES), on_reset=used)
+    env = Drawing("panda_table", EnvSettings(action="twist"), sim=True, overrides=(*BARE, RANGES))
 
     def episode(seed: int | None) -> tuple[dict[str, bytes], bytes]:
         seen, info = env.reset(seed=seed)
@@ -227,7 +240,7 @@ def test_the_same_seed_starts_at_the_same_poses_to_the_bit_and_without_one_come_
 
 
 def test_observations_show_objects_at_their_sampled_poses() -> None:
-    env = RigEnv("panda_table", sim=True, cameras=["scene"])
+    env = RigEnv("panda_table", EnvSettings(cameras=["scene"]), sim=True)
     try:
         pictures = []
         for seed in (1, 1, 2):
@@ -242,7 +255,7 @@ def test_observations_show_objects_at_their_sampled_poses() -> None:
 
 
 def test_poses_of_objects_are_observed_on_request() -> None:
-    env = RigEnv("panda_table", sim=True, action="twist", objects=["duck", "cube"], overrides=BARE)
+    env = RigEnv("panda_table", EnvSettings(action="twist", objects=["duck", "cube"]), sim=True, overrides=BARE)
     try:
         seen, info = env.reset(seed=3)
         assert env.observation_space.contains(seen)
@@ -256,9 +269,9 @@ def test_poses_of_objects_are_observed_on_request() -> None:
     finally:
         env.close()
     with pytest.raises(hal.DeviceNotFound):
-        RigEnv("panda_table", sim=True, objects=["cup"], overrides=BARE)
+        RigEnv("panda_table", EnvSettings(objects=["cup"]), sim=True, overrides=BARE)
     with raises_code(hal.NotSupported, "no_world"):
-        RigEnv("panda_table", driver="mock", objects=["cube"], overrides=BARE)
+        RigEnv("panda_table", EnvSettings(objects=["cube"]), driver="mock", overrides=BARE)
 
 
 def test_ranges_without_room_are_an_error() -> None:
@@ -272,27 +285,40 @@ def test_ranges_without_room_are_an_error() -> None:
         env.close()
 
 
-def test_the_hooks_decide_and_steps_are_counted() -> None:
-    env = RigEnv(
-        "panda_table",
-        driver="mock",
-        action="twist",
-        max_steps=5,
-        reward=lambda env, o: o.robots["panda"].tcp.position[0],
-        terminated=lambda env, o: o.robots["panda"].tcp.position[2] < -10.0,
-    )
+class Forward(RigEnv):
+    """Go 5 cm ahead."""
+
+    settings = EnvSettings(action="twist", max_steps=10)
+    goal = 1.0
+
+    def reward(self) -> float:
+        assert self.observation is not None
+        return float(self.observation.robots["panda"].tcp.position[0])
+
+    def success(self) -> bool:
+        return self.reward() > self.goal
+
+
+def test_a_subclass_decides_and_steps_are_counted() -> None:
+    env = Forward("panda_table", driver="mock", overrides=BARE)
     try:
-        env.reset()
-        for step in range(1, 6):
-            seen, reward, terminated, truncated, _ = env.step(np.zeros(7, np.float32))
-            assert reward == pytest.approx(seen["tcp"][0])
-            assert (terminated, truncated) == (False, step == 5)
+        for goal in (1.0, 0.33):
+            env.goal, (seen, _) = goal, env.reset()
+            assert seen["tcp"][0] < 0.32
+            ends = [(False, False)]
+            while not any(ends[-1]):
+                seen, reward, terminated, truncated, _ = env.step(np.array([0.2, *[0.0] * 6], np.float32))
+                assert reward == seen["tcp"][0], "of the new observation"
+                assert terminated == (reward > goal)
+                ends.append((terminated, truncated))
+            assert (len(ends) == 11) == (not terminated)
+            assert ends[-1] == ((True, False) if goal < 1.0 else (False, True))
     finally:
         env.close()
 
 
 def test_a_stop_truncates_with_its_reason_and_a_reset_does_not_acknowledge_it() -> None:
-    env = RigEnv("panda_table", driver="mock", action="twist", overrides=BARE)
+    env = RigEnv("panda_table", EnvSettings(action="twist"), driver="mock", overrides=BARE)
     try:
         env.reset()
         env.step(np.zeros(7, np.float32))
@@ -317,7 +343,7 @@ def test_a_stop_truncates_with_its_reason_and_a_reset_does_not_acknowledge_it() 
 
 
 def test_a_stop_stays_in_a_simulated_world_too() -> None:
-    env = RigEnv("panda_table", sim=True, action="twist", overrides=BARE)
+    env = RigEnv("panda_table", EnvSettings(action="twist"), sim=True, overrides=BARE)
     try:
         env.reset()
         env.rig.stop()
@@ -334,7 +360,7 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
             "hal.learning.gym.RigEnv._open",
             staticmethod(lambda *a, **k: hal.open("panda_table", driver="mock", clock="real_time", pad="none")),
         )
-        env = RigEnv(action="twist", rate_hz=10.0)
+        env = RigEnv(settings=EnvSettings(action="twist", rate_hz=10.0))
     try:
         env.reset()
         pictures, stamps = [], []
@@ -353,9 +379,9 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
 
 
 def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
-    for wrong in ({"action": "jump"}, {"robot": "pandda"}, {"cameras": ["wirst"]}):
+    for wrong in ({"action": "jump"}, {"robots": "pandda"}, {"cameras": ["wirst"]}):
         with pytest.raises(hal.HalError):
-            RigEnv("panda_table", driver="mock", **wrong)
+            RigEnv("panda_table", EnvSettings(**wrong), driver="mock")
 
 
 @pytest.mark.parametrize(
@@ -363,7 +389,7 @@ def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
     [
         ({"rate_hz": 0.0}, "bad_command"),
         ({"rate_hz": 0.5}, "rate_too_low"),
-        ({"reward": 1.0}, "not_callable"),
+        ({"action": "jump"}, "unknown_action"),
         ({"controller": "impedance"}, "bad_controller"),
         ({"controller": hal.JointImpedance(stiffness=[1.0])}, "bad_controller"),
         ({"controller": hal.JointImpedance(), "action": "torque"}, "torques_by_controller"),
@@ -371,7 +397,9 @@ def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
 )
 def test_arguments_of_later_calls_are_checked_at_once(wrong: dict[str, object], code: str) -> None:
     with raises_code(hal.CommandError, code):
-        RigEnv("panda_table", driver="mock", overrides=BARE, **wrong)
+        RigEnv("panda_table", EnvSettings(**wrong), driver="mock", overrides=BARE)  # type: ignore[arg-type]
+    with raises_code(hal.CommandError, "not_callable"):
+        RigEnv("panda_table", driver="mock", deadman="pad")  # type: ignore[arg-type]
     env = RigEnv("panda_table", driver="mock", overrides=BARE)
     try:
         with raises_code(hal.CommandError, "not_reset"):
@@ -386,7 +414,9 @@ def test_arguments_of_later_calls_are_checked_at_once(wrong: dict[str, object], 
 
 @pytest.mark.slow
 def test_several_in_processes_of_their_own() -> None:
-    make = functools.partial(RigEnv, "panda_table", sim=True, action="twist", overrides=BARE)  # importable there
+    make = functools.partial(
+        RigEnv, "panda_table", EnvSettings(action="twist"), sim=True, overrides=BARE
+    )  # importable there
     envs = gymnasium.vector.AsyncVectorEnv([make, make], context="spawn")
     try:
         seen, infos = envs.reset(seed=3)
@@ -409,7 +439,7 @@ TWO_ARMS = {
 
 
 def test_two_arms_are_one_environment_with_their_names_in_front() -> None:
-    env = RigEnv(TWO_ARMS, sim=True, robots=["left", "right"], action="twist", max_steps=50)
+    env = RigEnv(TWO_ARMS, EnvSettings(robots=["left", "right"], action="twist", max_steps=50), sim=True)
     try:
         check_env(env, skip_render_check=True)
         start, _ = env.reset(seed=1, options={"q": {"left": env.robot.home + 0.05}})
@@ -436,8 +466,6 @@ def test_two_arms_are_one_environment_with_their_names_in_front() -> None:
 
 
 def test_arms_of_an_environment_are_named_once() -> None:
-    for wrong in (["left", "left"], [], "left"):
+    for wrong in (["left", "left"], []):
         with raises_code(hal.CommandError, "bad_robots"):
-            RigEnv(TWO_ARMS, driver="mock", robots=wrong)
-    with raises_code(hal.CommandError, "bad_robots"):
-        RigEnv(TWO_ARMS, driver="mock", robot="left", robots=["left", "right"])
+            RigEnv(TWO_ARMS, EnvSettings(robots=wrong), driver="mock")

@@ -6,6 +6,7 @@ import functools
 import os
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,10 @@ gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from hal.gym import TaskEnv  # noqa: E402
+from hal.gym import TaskEnv, make_vec  # noqa: E402
 from hal.learning.tasks import TASKS  # noqa: E402
 from hal.learning.tasks.pick_cube import PickCube  # noqa: E402
+from hal.recording import Dataset, Recorder  # noqa: E402
 
 
 @pytest.fixture(scope="module", params=TASKS)
@@ -129,6 +131,59 @@ def test_what_cannot_be_is_named() -> None:
         make(distance=0.9)
     with raises_code(hal.CommandError, "bad_reward_type"):
         make(reward_type="shaped")
+    with pytest.raises(hal.CommandError, match=r"no argument 'robott'; did you mean robot=\?"):
+        make(robott="panda")
+    with raises_code(hal.NotSupported, "not_by_depth"):
+        gymnasium.make("hal/PegInHole-v0", judge="depth")
+    with raises_code(hal.NotSupported, "no_depth"):
+        make(rig="panda_table", sim=True, judge="depth", overrides=("cameras={}",))
+
+
+def test_worlds_of_a_task_step_together_and_each_is_the_task_with_its_seed() -> None:
+    envs = make_vec("hal/OpenDrawer-v0", 2, processes=1)
+    alone = gymnasium.make("hal/OpenDrawer-v0")
+    try:
+        seen, _ = envs.reset(seed=4)
+        expected, _ = alone.reset(seed=5)
+        assert all((seen[key][1] == values).all() for key, values in expected.items())
+        actions = np.array([[0.5, 0.0, -0.5, 0.0, -1.0], [-0.5, 0.2, 0.0, 0.5, 1.0]], np.float32)
+        seen, rewards, *_ = envs.step(actions)
+        expected, reward, *_ = alone.step(actions[1])
+        assert all((seen[key][1] == values).all() for key, values in expected.items())
+        assert rewards[1] == reward
+    finally:
+        envs.close()
+        alone.close()
+
+
+@pytest.mark.slow
+def test_depth_finds_the_cube_and_its_verdict_is_the_truth(tmp_path: Path) -> None:
+    pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
+    env = gymnasium.make("hal/PickCube-v0", judge="depth")
+    task = env.unwrapped
+    try:
+        env.reset(seed=2)
+        with Recorder(task.rig, tmp_path, fps=20, task="pick") as recorder:
+            recorder.start()
+            for action in task.solve():
+                seen, _, terminated, truncated, info = env.step(action)
+                truth = task.robot.base.inverse() @ task.rig.world.pose("cube")
+                assert seen["object_cube"][:3] == pytest.approx(truth.position, abs=0.006)
+                at_goal = np.linalg.norm(truth.position - task.poses["goal"].position) < 0.025
+                assert not terminated or at_goal
+                if terminated or truncated:
+                    break
+            recorder.save(success=info["success"], wait=True)
+        assert terminated
+        (episode,) = Dataset(tmp_path).episodes
+        assert episode.success
+        assert episode.columns["rig.object.cube"][-1, 2] > 0.66, "recorded on the way to its goal"
+        task.rig.world.set_pose("cube", hal.Pose([0.0, 0.0, -1.0]))
+        still = task.move(np.zeros(4), -1.0)
+        assert env.step(still)[-1]["success"] is False
+        assert task.hidden == {"cube"}
+    finally:
+        env.close()
 
 
 def test_an_object_out_of_reach_and_a_step_before_the_reset_are_refused() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,30 +18,29 @@ gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]
 from gymnasium.vector import AutoresetMode  # noqa: E402
 from gymnasium.wrappers.vector import DictInfoToList  # noqa: E402
 
-from hal.gym import RigEnv, RigVectorEnv, make_vec  # noqa: E402
+from hal.gym import EnvSettings, RigEnv, RigVectorEnv, make_vec  # noqa: E402
 
-RIG: dict[str, Any] = {
-    "sim": True,
-    "action": "twist",
-    "objects": ["cube"],
-    "overrides": ("cameras={}",),
-    "max_steps": 3,
-}
+RIG: dict[str, Any] = {"sim": True, "overrides": ("cameras={}",)}
 COUNT = 3
 
 
-def reward_function() -> Callable[[RigEnv, Any], float]:
-    def reward(env: RigEnv, seen: Any) -> float:  # copied into the processes, as it is in no module
-        if getattr(env, "broken", False):
-            raise ValueError("no reward")
-        return float(seen.robots["panda"].tcp.position[0])
+def make_class() -> type[RigEnv]:
+    class Ahead(RigEnv):  # copied into the processes, as it is in no module
+        settings = EnvSettings(action="twist", objects=["cube"], max_steps=3)
+        broken = False
 
-    return reward
+        def reward(self) -> float:
+            if self.broken:
+                raise ValueError("no reward")
+            assert self.observation is not None
+            return float(self.observation.robots["panda"].tcp.position[0])
+
+    return Ahead
 
 
 @pytest.fixture(scope="module")
 def envs() -> Iterator[RigVectorEnv]:
-    made = make_vec("panda_table", COUNT, processes=2, reward=reward_function(), **RIG)
+    made = make_vec(make_class(), COUNT, processes=2, **RIG)
     yield made
     made.close()
 
@@ -49,7 +48,7 @@ def envs() -> Iterator[RigVectorEnv]:
 def test_each_world_is_to_the_bit_a_rig_with_its_own_seed(envs: RigVectorEnv) -> None:
     """Past the end of an episode: the step after it resets, and ignores its action."""
     worlds = DictInfoToList(envs)
-    singles = [RigEnv("panda_table", reward=reward_function(), **RIG) for _ in range(COUNT)]
+    singles = [make_class()(**RIG) for _ in range(COUNT)]
     try:
         assert envs.single_observation_space == singles[0].observation_space
         assert envs.single_action_space == singles[0].action_space
@@ -122,8 +121,9 @@ def test_an_error_in_one_world_names_it_and_a_reset_starts_again(envs: RigVector
 
 def test_same_step_resets_at_once_and_keeps_the_last_pictures() -> None:
     overrides = ("cameras.scene.output={width: 32, height: 24}", "cameras.wrist.output={width: 32, height: 24}")
-    options: dict[str, Any] = {"driver": "mock", "action": "twist", "max_steps": 2, "overrides": overrides}
-    envs = make_vec("panda_table", 2, processes=1, autoreset_mode="SameStep", **options)
+    settings = EnvSettings(action="twist", max_steps=2)
+    options: dict[str, Any] = {"driver": "mock", "settings": settings, "overrides": overrides}
+    envs = make_vec(RigEnv, 2, processes=1, autoreset_mode="SameStep", **options)
     try:
         first, _ = envs.reset(seed=1)
         first = {key: values.copy() for key, values in first.items()}
@@ -146,7 +146,7 @@ def test_same_step_resets_at_once_and_keeps_the_last_pictures() -> None:
 
 
 def test_a_killed_process_is_an_error_and_leaves_nothing_behind() -> None:
-    envs = make_vec("panda_table", 2, processes=2, driver="mock", overrides=("cameras={}",))
+    envs = make_vec(RigEnv, 2, processes=2, driver="mock", overrides=("cameras={}",))
     try:
         envs.reset(seed=1)
         children = envs._children
@@ -168,9 +168,11 @@ def test_what_cannot_be_is_refused() -> None:
         ({"num_envs": 1.5}, hal.CommandError, "bad_count"),
         ({"processes": 0}, hal.CommandError, "bad_count"),
         ({"autoreset_mode": "never"}, hal.CommandError, "bad_autoreset"),
-        ({"unattended": True}, hal.CommandError, "not_simulated"),
+        ({"driver": "mock", "deadman": len}, hal.NotSupported, "not_simulated"),
         ({"sim": False, "overrides": ("robots.panda.real.host=172.16.0.2",)}, hal.NotSupported, "not_simulated"),
-        ({"driver": "mock", "action": "jump"}, hal.CommandError, "unknown_action"),
+        ({"driver": "mock", "settings": EnvSettings(robots=[])}, hal.CommandError, "bad_robots"),
+        ({"env": "hal/PickCup-v0"}, hal.CommandError, "unknown_environment"),
+        ({"env": "CartPole-v1"}, hal.NotSupported, "no_dict"),
     ):
         with raises_code(error, code):
-            make_vec("panda_table", **options)
+            make_vec(**{"env": RigEnv} | options)

@@ -1,0 +1,138 @@
+"""One arm of a task with its gripper: what it does, and what was last seen of it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import CommandError, NotSupported, Unreachable
+from ...geometry import Pose
+from ...gripper import Gripper
+from ...observation import Observation
+from ...robot import Robot
+
+if TYPE_CHECKING:
+    from .task_env import TaskEnv
+
+__all__ = ["Hand", "fold", "yaw_of"]
+
+Array = NDArray[np.float64]
+
+GRASP_HEIGHT = 0.03
+"""Height of the tcp over the table at which fingers grasp what stands on it, m."""
+UPRIGHT_GAIN = 6.0
+"""Speed of the turn that keeps the hand upright for each radian that it leans, 1/s."""
+_FREE = 0.01
+"""How much wider than an object the fingers must open, m."""
+_STILL = 0.2
+"""Speed of every joint below which the arm is at rest, rad/s."""
+
+
+class Hand:
+    """An arm of a task with its gripper. Poses and velocities are in the task's frame: the base of the first arm.
+
+    Args:
+        env: The task.
+        robot: The arm.
+        base: Base of the task's first arm in the world.
+    """
+
+    def __init__(self, env: TaskEnv, robot: Robot, base: Pose) -> None:
+        self.robot = robot
+        self._env = env
+        self._base = base.inverse() @ robot.base
+        self._turn = self._base.matrix()[:3, :3].T
+        self.ahead = yaw_of(self._base)
+        """Turn of the hand about z that is straight ahead for this arm, rad."""
+
+    @property
+    def gripper(self) -> Gripper:
+        """The gripper."""
+        assert self.robot.gripper is not None
+        return self.robot.gripper
+
+    @property
+    def seen(self) -> Observation:
+        """The newest observation. Raises CommandError before the first reset."""
+        if self._env.observation is None:
+            raise CommandError("call reset before step", code="not_reset")
+        return self._env.observation
+
+    @property
+    def tcp(self) -> Pose:
+        """Pose of the tcp."""
+        return self._base @ self.seen.robots[self.robot.name].tcp
+
+    @property
+    def opening(self) -> float:
+        """Distance between the fingers, m."""
+        return self.seen.grippers[self.robot.name].width
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the arm is at rest."""
+        return bool(np.abs(self.seen.robots[self.robot.name].dq).max() < _STILL)
+
+    def holds(self, name: str, at: ArrayLike = (0.0, 0.0, 0.0)) -> bool:
+        """Return whether the fingers press on something, and a point of the object (3,), m, is where they are."""
+        near = np.linalg.norm(self._env.poses[name].transform(at) - self.tcp.position) < GRASP_HEIGHT
+        return bool(near) and bool(self.seen.grippers[self.robot.name].grasped)
+
+    def twist(self, velocity: Array, most: Array) -> list[float]:
+        """Return the twist (6,) along the axes of the arm's base, with the hand kept upright.
+
+        Args:
+            velocity: Velocity of the tcp along x, y and z, m/s, and of its turn about z, rad/s (4,).
+            most: Greatest of them (4,).
+        """
+        lean = np.cross(self.tcp.matrix()[:3, 2], (0.0, 0.0, -1.0))[:2]  # what turns the tcp's z axis down again
+        turn = [*(UPRIGHT_GAIN * lean).clip(-most[3], most[3]), velocity[3]]
+        return [*(self._turn @ velocity[:3]).tolist(), *(self._turn @ turn).tolist()]
+
+    def check_gripper(self, width: float) -> None:
+        """Check that the arm has a gripper that opens far enough for an object. Raises NotSupported."""
+        gripper, task = self.robot.gripper, type(self._env).__name__
+        if gripper is None:
+            text = f"robot=: this arm has no gripper, which {task} needs; `hal list robots` shows those that have one"
+            raise NotSupported(text, code="no_gripper")
+        if width and gripper.width_max < width + _FREE:
+            text = f"robot=: its fingers open to {gripper.width_max:.3f} m; {task} needs {width + _FREE:.3f} m"
+            raise NotSupported(text, code="too_wide")
+
+    def reach(self, position: ArrayLike, yaw: float, what: str) -> Array:
+        """Return joint positions (n,), rad, with the hand over or around something.
+
+        ``yaw`` is its turn about z from straight ahead, rad.
+
+        Raises:
+            CommandError: There are none (code ``out_of_reach``).
+        """
+        x, y, z = np.asarray(position, float)
+        goal = Pose.from_rpy((x, y, max(z, GRASP_HEIGHT)), (math.pi, 0.0, self.ahead + yaw))
+        try:
+            q = self.robot.ik(self._base.inverse() @ goal, self.robot.home)
+            others = tuple(f"{name}/" for name in self._env.rig.robots if name != self.robot.name)  # they move
+            pairs = self.robot.collisions.check(q)
+            touched = [pair for pair in pairs if not (pair.first.startswith(others) or pair.second.startswith(others))]
+        except Unreachable:
+            why = "the arm does not get there"
+        else:
+            if not touched:
+                return q
+            why = str(touched[0])
+        text = f"{what} is out of reach: with the hand pointing down at {x:.2f}, {y:.2f}, {z:.2f} m, {why}"
+        raise CommandError(f"{text}; choose another robot, place or distance=", code="out_of_reach")
+
+
+def fold(angle: float, period: float) -> float:
+    """Return an angle plus a multiple of ``period``, at most half a period from 0, rad."""
+    return angle - period * round(angle / period)
+
+
+def yaw_of(pose: Pose) -> float:
+    """Return the angle of a pose's x axis about z, rad."""
+    x, y = pose.matrix()[:2, 0]
+    return math.atan2(y, x)
