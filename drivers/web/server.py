@@ -147,33 +147,18 @@ class AppChannel:
         """Set when the app is gone."""
         self._channel = channel
         self._receive = receive
-        self._changed = asyncio.Event()
-        self._sending: asyncio.Future[None] | None = None
+        self._unsent = b""
+        self._writing = False
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     def start(self) -> None:
         """Read and write the channel in the running loop from now on."""
         sock = self._channel.sock
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _KERNEL_BYTES)
         sock.setblocking(False)
-        asyncio.get_running_loop().add_reader(sock, self._read)
-        self._sending = asyncio.ensure_future(self._send_all())
-
-    def flush(self) -> None:
-        """Send what waits, as far as the app takes it; the rest follows when it does."""
-        self._changed.set()
-
-    async def _send_all(self) -> None:
-        loop = asyncio.get_running_loop()
-        try:
-            while True:
-                await self._changed.wait()
-                self._changed.clear()
-                while (message := self.queue.pop()) is not None:
-                    await loop.sock_sendall(self._channel.sock, encode(message).encode() + b"\n")
-        except OSError:
-            pass  # the app is gone
-        finally:
-            self._end()
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(sock, self._read)
+        self.flush()
 
     def _read(self) -> None:
         try:
@@ -188,8 +173,40 @@ class AppChannel:
         except Exception:  # a message that cannot be passed on must not block the next one, nor a stop
             traceback.print_exc()
 
+    def flush(self) -> None:
+        """Send what waits, as far as the app takes it; the rest follows when it does."""
+        if self._loop is None or self.ended.is_set():
+            return
+        try:
+            while self._fill():
+                self._unsent = self._unsent[self._channel.sock.send(self._unsent) :]
+            self._write_later(False)
+        except BlockingIOError:
+            self._write_later(True)
+        except OSError:
+            self._end()
+
+    def _fill(self) -> bool:
+        """Return whether there is something to send."""
+        if not self._unsent:
+            message = self.queue.pop()
+            if message is not None:
+                self._unsent = encode(message).encode() + b"\n"
+        return bool(self._unsent)
+
+    def _write_later(self, later: bool) -> None:
+        assert self._loop is not None
+        if later != self._writing:
+            self._writing = later
+            if later:
+                self._loop.add_writer(self._channel.sock, self.flush)
+            else:
+                self._loop.remove_writer(self._channel.sock)
+
     def _end(self) -> None:
-        asyncio.get_running_loop().remove_reader(self._channel.sock)
+        if self._loop is not None:
+            self._loop.remove_reader(self._channel.sock)
+            self._write_later(False)
         self.ended.set()
 
 
