@@ -179,7 +179,7 @@ class Dynamics:
         self._model.appendBodyToJoint(frame.parentJoint, inertia, self._pin.SE3.Identity())
 
     def _reorder(self, values: Floats) -> Array:
-        array = np.array(values, float)
+        array = np.asarray(values, float)
         if array.shape != self._shape:
             raise CommandError(f"one number for each joint is needed, shape {self._shape}, not {array.shape}")
         return array if self._inverse_columns is None else array[self._inverse_columns]

@@ -50,8 +50,9 @@ class Motors:
         """Greatest speed of each joint, rad/s or m/s."""
         self.arms: dict[str, NDArray[np.intp]] = {}
         """Places of the joints of each arm, without its fingers."""
-        self.torques: dict[str, tuple[Any, Array]] = {}
-        """Arms that are driven by torques instead: places of their joints, torques on top of gravity, Nm."""
+        self.torques: dict[str, tuple[Any, Array, Floats]] = {}
+        """Arms that are driven by torques instead: places of their joints, torques on top of gravity, Nm, and these as
+        they were given."""
         self.damping = np.zeros(n)
         """Damping of each joint in the URDF, Nm s/rad. It acts only on arms that are driven by torques."""
         gain = min(STIFFNESS, 1.0 / dt)
@@ -80,12 +81,13 @@ class Motors:
         for arm in self.arms.values():
             self._alone[arm] = 0.0
         self.limit()
-        for at, _ in self.torques.values():
+        for at, *_ in self.torques.values():
             model.dof_damping[at] = self.damping[at]
         # The inertia of the driven joints: where each entry of MuJoCo's sparse lower triangle is in the full matrix.
         rows = np.repeat(np.arange(n), model.M_rownnz[:n])
         columns = model.M_colind[: len(rows)]
         self._dense = np.zeros((n, n))
+        self._dense_entries = self._dense.reshape(-1)
         self._where = np.append(rows * n + columns, columns * n + rows)
         self._entries = np.append(np.arange(len(rows)), np.arange(len(rows)))
 
@@ -105,9 +107,12 @@ class Motors:
 
         Its joints then have the damping of the URDF, which MuJoCo integrates implicitly.
         """
-        if name not in self.torques:
+        known = self.torques.get(name)
+        if known is None:
             self._model.dof_damping[at] = self.damping[at]
-        self.torques[name] = (at, np.array(tau, float))
+        elif known[2] is tau:
+            return
+        self.torques[name] = (at, np.array(tau, float), tau)
 
     def drive_by_motors(self, name: str) -> bool:
         """Let the motors of an arm follow positions again; return whether torques drove it."""
@@ -125,7 +130,7 @@ class Motors:
         np.maximum(new, self._least, out=new)
         np.minimum(new, self._most, out=self._results)
         self._to_acceleration.dot(self._speeds, self._driven_acceleration)
-        for at, _ in self.torques.values():
+        for at, *_ in self.torques.values():
             self._driven_acceleration[at] = 0.0
         self._mulm(self._model, self._data, self._force, self._acceleration)
         np.add(force, self._bias, out=force)
@@ -147,7 +152,7 @@ class Motors:
         for at_rest, now in self._places:
             np.copyto(at_rest, now)
         mujoco.mj_rne(model, self._at_rest, 0, self._gravity)
-        for at, torques in self.torques.values():
+        for at, torques, _ in self.torques.values():
             self._driven_force[at] = torques + self._gravity[: self.n][at]
 
     def _share(self, excess: Array) -> None:
@@ -189,6 +194,6 @@ class Motors:
 
     def inertia(self, data: Any, at: slice | NDArray[np.intp]) -> Array:
         """Return the joint-space inertia (k, k), kg m2, of the joints at these places, of the state in ``data``."""
-        self._dense.flat[self._where] = data.M[self._entries]
+        self._dense_entries[self._where] = data.M[self._entries]
         block: Array = self._dense[at][:, at]
         return block

@@ -185,12 +185,12 @@ Record = TypeVar("Record")
 class Newest(Generic[Raw, Record]):
     """Decodes the newest record of a mailbox once; a call that finds nothing new costs one comparison."""
 
-    __slots__ = ("_decode", "_known", "_read", "_seq")
+    __slots__ = ("_announced", "_decode", "_known", "_read")
 
     def __init__(
-        self, seq: Callable[[], int], read: Callable[[], tuple[int, Raw] | None], decode: Callable[[Raw], Record]
+        self, box: Mailbox, read: Callable[[], tuple[int, Raw] | None], decode: Callable[[Raw], Record]
     ) -> None:
-        self._seq = seq
+        self._announced = box._announced
         self._read = read
         self._decode = decode
         self._known: tuple[int, Record | None] = (0, None)  # its number, and itself; replaced together
@@ -198,7 +198,7 @@ class Newest(Generic[Raw, Record]):
     def get(self) -> Record | None:
         """Return the newest record, decoded; None before the first one."""
         known = self._known
-        if self._seq() != known[0]:
+        if self._announced[0] != known[0]:
             found = self._read()
             if found is not None and found[0] != known[0]:
                 self._known = known = (found[0], self._decode(found[1]))
@@ -207,7 +207,7 @@ class Newest(Generic[Raw, Record]):
 
 def make_reader(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record]) -> Callable[[], Record | None]:
     """Return a function that returns the newest record of ``box``, decoded."""
-    return Newest(box.seq, box.read, decode).get
+    return Newest(box, box.read, decode).get
 
 
 _T = struct.Struct("<d")

@@ -383,9 +383,9 @@ class RobotMail:
         """Returns the newest command; None before the first one."""
         self.get_deadman = make_reader(self.deadman, DeadmanRecord._make)
         """Returns the newest record of the dead-man; None before the first one."""
-        self.get_state = Newest(state.seq, state.read_bytes, self._layout.state).get
+        self.get_state = Newest(state, state.read_bytes, self._layout.state).get
         """Returns the newest state; None before the first one."""
-        self.peek = Newest(state.seq, state.read_bytes, self._layout.servo).get
+        self.peek = Newest(state, state.read_bytes, self._layout.servo).get
         """Returns only the servo's part of the newest state: for every ``send``."""
         self.history = History(state, self._layout.state)
         """The last :data:`STATES` states."""

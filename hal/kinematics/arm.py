@@ -332,7 +332,7 @@ class Kinematics:
         return frame
 
     def _ordered(self, q: Sequence[float] | Array) -> Array:
-        values = np.array(q, float)
+        values = np.asarray(q, float)
         if values.shape != self._shape:
             raise CommandError(f"q must have shape {self._shape}, not {values.shape}")
         return values if self._inverse_columns is None else values[self._inverse_columns]

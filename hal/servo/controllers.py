@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from math import dist, inf, sqrt
+from math import dist, hypot, inf, sqrt
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -326,6 +326,9 @@ class ControllerLaw:
         reach: Greatest speed of the tcp at joint speeds of length 1, m/rad.
     """
 
+    _tcp: TcpInMotion
+    _turn: Array
+
     def __init__(
         self,
         controller: Controller,
@@ -362,11 +365,9 @@ class ControllerLaw:
 
         self._eigen: Any = eigenpy.SelfAdjointEigenSolver(np.eye(self._rows))
         self._llt: Any = eigenpy.LLT(np.eye(self._rows))
-        self._unit = np.eye(n)
-        self._eigen_mass: Any = eigenpy.SelfAdjointEigenSolver(self._unit)
+        self._eigen_mass: Any = eigenpy.SelfAdjointEigenSolver(np.eye(n))
         self._lengths = np.zeros((2, self._rows))
         """Lengths of the springs of turn and of position, m and rad."""
-        self._posture: Array | None = None
         self._tuned_at: Floats = ()
         """Joint positions of what follows, rad; empty if the gains are different now."""
         self._stiffness = self._damping = np.zeros((0, 0))
@@ -383,10 +384,7 @@ class ControllerLaw:
         self._tau = np.zeros((2, n))
         self._stretched: Array = np.zeros(3)
         """Lengths (k,) of the springs in the last call."""
-        self._tcp: TcpInMotion
-        self._turn: Array
-        self._goal = self._numbers(controller)
-        self._from = self._now = self._goal
+        self._goal = self._from = self._now = self._numbers(controller)
         self._ramped = 1.0
         self._apply(self._goal)
         self._set_posture(controller)
@@ -446,7 +444,7 @@ class ControllerLaw:
         Returns:
             Two rows (2, n), Nm, whose sum is the controller's. The second is what the springs of the tcp's position
             exert, or those of the joints; the first is all the rest, which alone makes the tcp as fast as the
-            set-point, and no faster.
+            set-point, and no faster. They are valid until the next call.
         """
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
@@ -462,7 +460,7 @@ class ControllerLaw:
             rest += self._dynamics.coriolis(tcp.q, tcp.dq)
         if self.in_joints:
             if not tuned:
-                self._tune(arm.q, inertia.solve(self._unit), inertia)
+                self._tune(arm.q, inertia.inverse, inertia)
             self._stretched = lengths = self._shortened(q_set - tcp.q)
             self._tau[0], self._tau[1] = self._damping.dot(lag), lengths.dot(self._stiffness)
         else:
@@ -479,9 +477,8 @@ class ControllerLaw:
             if self._redundant:
                 rest += self._posture_torques(q_set, lag, eased, ease, force)
             force.dot(task, self._tau)
-        tau = self._tau
-        tau[0] += rest
-        return tau
+        self._tau[0] += rest
+        return self._tau
 
     def _force(self, lag: Array, jacobian: Array, error: Floats) -> Array:
         """Return the forces (2, k) of the tcp's springs and dampers: those of its position's springs are the second."""
@@ -510,8 +507,7 @@ class ControllerLaw:
     @property
     def most_gain(self) -> float:
         """Upper bound of the length of :meth:`gain`, m/s."""
-        lengths = self._stretched
-        return self._most_gain * sqrt(lengths.dot(lengths))
+        return self._most_gain * hypot(*self._stretched.tolist())
 
     def gain(self) -> Array:
         """Return the velocity (3,) of the tcp, m/s, that the springs may add if all torques are removed from now on.

@@ -167,19 +167,12 @@ class TcpReference:
         smoother = self._smoother
         now = smoother.dq
         speed = self._root * hypot(*dq, *now)
-        near = self._around(dist(dq, self._centre), dist(now, self._centre))
+        # Each joint moves at any share of its speed at the centre, plus what it may be away from there.
+        near = self._centre_speed + self._stretch * hypot(dist(dq, self._centre), dist(now, self._centre))
         if near + speed * self._reach_length * dist(smoother.q, self._at) <= cap:
             return True
         self._put_centre(dq)
-        return self._around(0.0, dist(now, dq)) + speed * self._moved() <= cap
-
-    def _around(self, *distances: float) -> float:
-        """Return a bound of the tcp's speed, m/s, at the reference.
-
-        Each joint moves at any share of its speed at the centre, plus what it may be away from there: in all, joint
-        speeds of these lengths (rad/s).
-        """
-        return self._centre_speed + self._stretch * hypot(*distances)
+        return self._centre_speed + self._stretch * dist(now, dq) + speed * self._moved() <= cap
 
     def _put_centre(self, dq: Floats) -> None:
         """Compute the tcp's greatest speed for all shares of the joint speeds ``dq`` (n,), rad/s."""
@@ -216,13 +209,13 @@ class TcpReference:
             fastest = self._root * max(speed + self._overrun * acceleration, step)
             way = self._reach_length * step * dt + self._per_speed * speed + self._per_acceleration * acceleration
             ramps = self._overrun_tcp * acceleration * acceleration + fastest * way
-            near = self._around(max(dist(dq, self._centre), dist(mean, self._centre)))
+            near = self._centre_speed + self._stretch * max(dist(dq, self._centre), dist(mean, self._centre))
             if near + ramps + fastest * self._reach_length * dist(q, self._at) <= cap:
                 return True
             if self._like_proven_stop(mean, fastest) <= cap:
                 return True
             self._put_centre(dq)
-            if self._around(dist(mean, dq)) + ramps + fastest * self._moved() <= cap:
+            if self._centre_speed + self._stretch * dist(mean, dq) + ramps + fastest * self._moved() <= cap:
                 return True
         self._refresh()
         bound = self._fastest_in_stop(cap)

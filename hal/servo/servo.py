@@ -408,9 +408,9 @@ class Servo:
 
     def _is_possible(self, reading: Reading) -> bool:
         """Return whether the measured values of this reading are possible, and all of its torques and forces finite."""
-        torques = *(reading.tau or ()), *(reading.tau_ext or ()), *(reading.tau_commanded or ())
-        finite = isfinite(hypot(*torques, *(reading.wrench_ext or ())))
-        return finite and self._is_position(reading.q) and self._is_sound(reading.dq)
+        _, _, _, q, dq, tau, _, _, tau_ext, wrench_ext, _, tau_commanded = reading
+        finite = isfinite(hypot(*(tau or ()), *(tau_ext or ()), *(tau_commanded or ()), *(wrench_ext or ())))
+        return finite and self._is_position(q) and self._is_sound(dq)
 
     def _overruns(self) -> Trip:
         """Return ``Trip.LIMIT`` if an arm that follows torques, or is braked by them, runs into a limit."""
