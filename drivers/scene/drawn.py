@@ -19,6 +19,7 @@ from hal.geometry import Pose, matrix_to_quaternion
 from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfModel
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
+from .lighting import Look
 from .shapes import Visual
 from .urdf_files import absent_packages, checked_urdf, drawn_visuals, has_free_base, where_to_get
 from .values import body_spec, nearest
@@ -76,6 +77,7 @@ class DrawnWorld:
         self.bodies: dict[str, DrawnBody] = {}
         self.revision = 0
         """Number of edits so far, as of the world."""
+        self.look = Look()
         self._absent: dict[str, list[str]] = {}
         """Packages of meshes that are not installed -> the bodies that need them."""
         self._numbers = count()

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from hal.geometry import Pose
 
+from .lighting import Look
+
 __all__ = [
     "DrawnPart",
     "Mesh",
@@ -77,6 +79,10 @@ class RenderScene(Protocol):
     @property
     def revision(self) -> int:
         """Changes whenever bodies or their visual shapes do."""
+
+    @property
+    def look(self) -> Look:
+        """Light, shadows and background."""
 
     def visuals(self, body: int) -> tuple[Visual, ...]:
         """Return the visual shapes of the body with this id."""
