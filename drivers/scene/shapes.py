@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hal.geometry import Pose
 
 from .lighting import Look
+from .textures import load_texture
 
 __all__ = [
     "DrawnPart",
@@ -37,6 +38,8 @@ Points = NDArray[np.float32]
 _SEGMENTS, _COARSE_SEGMENTS = 48, 16
 """Segments of a circle, and of that of a sphere or capsule that is small in the picture. A chord leaves the circle by
 0.2 % of its radius, or by 1.9 %."""
+_TEXTURE = 0.25
+"""Side of a texture that covers a body, m."""
 _PLANE_HALF = 50.0
 """Half the side of the square that is drawn for an infinite plane, m."""
 
@@ -69,6 +72,8 @@ class Visual(NamedTuple):
     orientation: tuple[float, ...]
     """(4,) xyzw."""
     rgba: tuple[float, ...]
+    texture: str = ""
+    """Picture that covers it instead of its own, see :mod:`.textures`; empty for none."""
 
 
 class RenderScene(Protocol):
@@ -141,6 +146,28 @@ class Mesh:
             positions=(self.positions @ linear.T + translation).astype(np.float32),
             normals=unit(self.normals @ np.linalg.inv(linear)).astype(np.float32),
             faces=np.ascontiguousarray(faces),
+        )
+
+    def covered(self, texture: NDArray[np.uint8], side: float) -> Mesh:
+        """Return the mesh without colours of its own, covered with a picture from six sides.
+
+        Args:
+            texture: (H, W, 3) RGB.
+            side: Width and height of the picture on the surface, m.
+        """
+        corners = self.positions[self.faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        axis = np.abs(across).argmax(axis=1)
+        used = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+        uv = np.take_along_axis(corners, used[:, None, :].repeat(3, axis=1), axis=2).reshape(-1, 2) / side
+        return replace(
+            self,
+            positions=corners.reshape(-1, 3),
+            normals=self.normals[self.faces].reshape(-1, 3),
+            colors=np.full((3 * len(self.faces), 4), 255, np.uint8),
+            faces=np.arange(3 * len(self.faces), dtype=np.uint32).reshape(-1, 3),
+            uv=uv.astype(np.float32),
+            texture=texture,
         )
 
     def tinted(self, rgba: tuple[float, ...]) -> Mesh:
@@ -301,6 +328,8 @@ def parts_of(body: int, visuals: Sequence[Visual], load_mesh: Callable[[str], Se
     for visual, frame, mesh in found:
         for coarse in (False, True) if visual.link in heavy else (False,):
             drawn = mesh.coarse if coarse and mesh.coarse is not None else mesh
+            if visual.texture:
+                drawn = drawn.covered(load_texture(visual.texture), _TEXTURE)
             texture = None if drawn.texture is None else id(drawn.texture)
             key = (visual.link, coarse, texture, drawn.closed)
             groups.setdefault(key, []).append(drawn.tinted(visual.rgba).moved(frame))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +18,7 @@ from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, read_yaml, suggest, validate
 from .models import FileSource
 from .schema import (
+    ENDS,
     Factor,
     Flag,
     Mass,
@@ -33,24 +34,15 @@ from .schema import (
     Strict,
     Unknown,
     ValueProblem,
+    check_order,
     describe,
 )
 
 __all__ = ["CarriedBy", "ObjectConfig", "RandomPose", "load_objects"]
 
-_ENDS = "the least and the greatest"
-
-
-def _check_order(ends: tuple[float, float]) -> tuple[float, float]:
-    least, greatest = ends
-    if least > greatest:
-        raise ValueProblem(f"must be {_ENDS}; {least:g} is above {greatest:g}", "empty_range")
-    return ends
-
-
 _Two = tuple[float, float]
-Range = Annotated[_Two, Several(Quantity("m", -50.0, 50.0), 2, _ENDS), AfterValidator(_check_order)]
-Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, _ENDS), AfterValidator(_check_order)]
+Range = Annotated[_Two, Several(Quantity("m", -50.0, 50.0), 2, ENDS), AfterValidator(check_order)]
+Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, ENDS), AfterValidator(check_order)]
 
 
 class RandomPose(Strict):
@@ -166,17 +158,22 @@ class ObjectConfig(Strict):
         return self
 
 
-def load_objects(context: Context) -> tuple[BodySpec, ...]:
-    """Return the objects of a rig. Problems are added to ``context``; then the objects may be incomplete.
+def load_objects(context: Context, entries: Sequence[Any], section: str, taken: dict[str, str]) -> tuple[BodySpec, ...]:
+    """Return objects of a rig. Problems are added to ``context``; then the objects may be incomplete.
 
     The robots of the rig have been resolved before, so that their URDFs and other names of links are known.
+
+    Args:
+        context: The rig.
+        entries: The objects as written.
+        section: Key of the list of them.
+        taken: Names of the rig's robots and other objects, each with its place in words; the new ones are added.
     """
     bodies = []
     problems, source = context.problems, context.source
-    taken = {name: f"robots.{name} in {source}" for name in getattr(context.rig, "robots", ())}
-    robots = tuple(taken)
-    for k, entry in enumerate(context.rig.objects):
-        key = f"objects.{k}"
+    robots = tuple(getattr(context.rig, "robots", ()))
+    for k, entry in enumerate(entries):
+        key = f"{section}.{k}"
         loaded = _load(entry, source, context.base, key, problems)
         if loaded is None:
             continue

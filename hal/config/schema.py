@@ -25,6 +25,7 @@ __all__ = [
     "Coordinate",
     "Degrees",
     "Direction",
+    "ENDS",
     "Distance",
     "Factor",
     "FingerPosition",
@@ -57,6 +58,7 @@ __all__ = [
     "ValueProblem",
     "Velocities",
     "ViewAngle",
+    "check_order",
     "describe",
     "is_number",
     "list_keys",
@@ -212,6 +214,18 @@ class Several:
         size = {"minItems": self.count, "maxItems": self.count} if self.count is not None else {}
         several = {"type": "array", "items": item, "description": self.what, **size}
         return {"anyOf": [item, several]} if self.single else several
+
+
+ENDS = "the least and the greatest"
+"""Numbers of a range, for messages."""
+
+
+def check_order(ends: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the two ends of a range. Raises ValueProblem if the range is upside down."""
+    least, greatest = ends
+    if least > greatest:
+        raise ValueProblem(f"must be {ENDS}; {least:g} is above {greatest:g}", "empty_range")
+    return ends
 
 
 def _normalise(q: tuple[float, ...]) -> tuple[float, ...]:
