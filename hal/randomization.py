@@ -12,7 +12,7 @@ import math
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from .arguments import integer
 from .errors import CommandError
 from .geometry import Pose
 from .specs import BodySpec, CameraSpec, RandomizeSpec, ViewSpec, WorldSpec
-
-if TYPE_CHECKING:
-    from .world import World
 
 __all__ = [
     "COUNT",
@@ -75,9 +72,9 @@ def _light_number(key: str) -> int:
     return int(number) if key.startswith("light.") and number.isdecimal() else 0
 
 
-def list_distractors(world: WorldSpec) -> tuple[BodySpec, ...]:
+def list_distractors(world: WorldSpec | None) -> tuple[BodySpec, ...]:
     """Return the objects that a randomization may add to a world."""
-    return () if world.randomize is None else world.randomize.distractors
+    return () if world is None or world.randomize is None else world.randomize.distractors
 
 
 def vary_camera(spec: CameraSpec, values: Values) -> CameraSpec:
@@ -102,6 +99,18 @@ def _widen(K: Any, scale: float) -> Any:
     """Return a camera matrix whose picture shows ``scale`` times as much to each side."""
     (fx, skew, cx), (zero, fy, cy), last = K
     return (fx / scale, skew / scale, cx), (zero, fy / scale, cy), last
+
+
+class VariedWorld(Protocol):
+    """What is needed of a :class:`hal.world.World`."""
+
+    @property
+    def bodies(self) -> tuple[str, ...]: ...
+    def links(self, name: str) -> tuple[str, ...]: ...
+    def add(self, body: BodySpec) -> None: ...
+    def remove(self, name: str) -> None: ...
+    def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]: ...
+    def set_dynamics(self, name: str, link: str | None = None, **values: float) -> dict[str, Any]: ...
 
 
 class Randomizer:
@@ -136,7 +145,7 @@ class Randomizer:
         copied: dict[str, Any] = json.loads(json.dumps(dict(given)))
         return copied | {"seed": integer("seed", copied["seed"], least=0)}
 
-    def apply(self, world: World, record: dict[str, Any] | None) -> dict[str, Any]:
+    def apply(self, world: VariedWorld, record: dict[str, Any] | None) -> dict[str, Any]:
         """Restore the dynamics and objects of the rig file, then apply those of ``record``.
 
         Returns:
@@ -167,7 +176,7 @@ class Randomizer:
         self.record = record
         return {"values": dict(values), "seed": 0 if record is None else record["seed"]}
 
-    def _scale(self, world: World, name: str, links: Iterable[str], quantity: str, factor: float) -> None:
+    def _scale(self, world: VariedWorld, name: str, links: Iterable[str], quantity: str, factor: float) -> None:
         for link in links:
             before = world.dynamics(name, link)[quantity]
             if before:

@@ -13,7 +13,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-__all__ = ["Delay", "Disturbances", "Randomized"]
+__all__ = ["UNCHANGED", "Delay", "Disturbances", "Randomized"]
 
 T = TypeVar("T")
 
@@ -29,6 +29,15 @@ class Randomized(NamedTuple):
     def get(self, section: str, key: str) -> float:
         """Return a latency or a standard deviation; 0 where none was drawn."""
         return float(self.values.get(f"{section}.{key}", 0.0))
+
+    @classmethod
+    def take(cls, values: Mapping[str, Any], seed: int) -> Randomized:
+        """Return what an edit says; :data:`UNCHANGED` without values."""
+        return cls(dict(values), seed) if values else UNCHANGED
+
+
+UNCHANGED = Randomized({}, 0)
+"""The world of the rig file."""
 
 
 class Delay(Generic[T]):
@@ -76,20 +85,28 @@ class Disturbances:
 
     def __init__(self, world: Any, section: str, noise: Sequence[str]) -> None:
         self._world, self._section, self._keys = world, section, noise
-        self._known: Randomized | None = None
+        self._known = UNCHANGED
         self.sensed: Delay[tuple[float, tuple[Any, ...]]] = Delay(0)
         self.commands: Delay[Callable[[], None]] = Delay(0)
-        self._deviations: list[float] = []
+        self._deviations = [0.0] * len(noise)
         self._command_noise = 0.0
         self._random = np.random.default_rng(0)
         self.active = False
         """Whether anything is disturbed."""
 
     def update(self) -> None:
-        """Follow a new randomization of the world."""
+        """Follow a new randomization of the world, and carry out the newest command that has arrived.
+
+        To be called after every step.
+        """
         drawn: Randomized = self._world.randomized
-        if drawn is self._known:
-            return
+        if drawn is not self._known:
+            self._prepare(drawn)
+        arrived = self.commands.take(self._world.steps) if self.active else None
+        if arrived is not None:
+            arrived()
+
+    def _prepare(self, drawn: Randomized) -> None:
         late = self.commands.take(1 << 62)
         if late is not None:
             late()  # the newest command is not lost
@@ -108,6 +125,8 @@ class Disturbances:
         Args:
             *parts: Numbers or sequences of them, in the order of the keys of the noise.
         """
+        if not self.active:
+            return self._world.t, parts
         step = self._world.steps
         noisy = tuple(
             self._blur(part, deviation) if deviation else part
@@ -133,12 +152,6 @@ class Disturbances:
             self.commands.put(self._world.steps, command)
         else:
             command()
-
-    def deliver(self) -> None:
-        """Carry out the newest command that has arrived; to be called after every step."""
-        arrived = self.commands.take(self._world.steps)
-        if arrived is not None:
-            arrived()
 
     def forget(self) -> None:
         """Forget measurements and commands that are under way, after a reset or at a stop of the device's own."""

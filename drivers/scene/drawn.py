@@ -21,7 +21,7 @@ from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfModel
 from hal.randomization import COUNT
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
-from .disturbances import Randomized
+from .disturbances import UNCHANGED, Randomized
 from .lighting import BACKGROUND, Light, Look
 from .shapes import Visual
 from .urdf_files import absent_packages, checked_urdf, drawn_visuals, has_free_base, where_to_get
@@ -81,7 +81,7 @@ class DrawnWorld:
         self.revision = 0
         """Number of edits so far, as of the world."""
         self.look = Look(shadows=spec.shadows)
-        self.randomized = Randomized({}, 0)
+        self.randomized = UNCHANGED
         """What ``rig.world.randomize`` applied last."""
         self._absent: dict[str, list[str]] = {}
         """Packages of meshes that are not installed -> the bodies that need them."""
@@ -112,7 +112,7 @@ class DrawnWorld:
             body, rgba = self.bodies[params["name"]], tuple(float(value) for value in params["rgba"])
             body.visuals = tuple(visual._replace(rgba=rgba) for visual in body.visuals)
         elif method == "randomize":
-            self.randomized = Randomized(params["values"], params["seed"])
+            self.randomized = Randomized.take(params["values"], params["seed"])
             self.look = _make_look(params["values"], self.spec.shadows)
         else:
             raise ValueError(f"{method} is no edit of what is drawn")

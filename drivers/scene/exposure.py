@@ -39,7 +39,7 @@ from hal.geometry import Pose
 from hal.randomization import vary_camera
 from hal.specs import CameraSpec, SensorSpec
 
-from .disturbances import Randomized
+from .disturbances import UNCHANGED, Randomized
 from .renderer import RenderedImages, Renderer
 
 __all__ = [
@@ -97,7 +97,7 @@ class Exposure:
     def __init__(self, spec: CameraSpec) -> None:
         self._nominal = spec
         self._frames_before = 0
-        self._prepare(Randomized({}, 0))
+        self._prepare(UNCHANGED)
 
     def _prepare(self, drawn: Randomized) -> None:
         """Build the views, and the noise, of a randomization."""
@@ -129,7 +129,7 @@ class Exposure:
         """
         if world.randomized is not self.randomized:
             self._prepare(world.randomized)
-            self._frames_before = number - 1
+            self._frames_before = number - 1 if world.randomized.values else 0
         here = camera_pose(world, self.spec)
         view = _moved(here, self._T_color)
         images = RenderedImages(None, None, None, None)

@@ -188,11 +188,9 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         """Return the fingers after the last physics step; ``force`` is that of the weaker motor, N."""
         self._expect_open()
         self._disturbances.update()
-        t, (width, force, moving, grasped) = self._world.t, self._sense()
-        if self._disturbances.active:
-            begun = moving
-            t, (width, force, moving, grasped) = self._disturbances.measure(width, force, moving, grasped)
-            moving = moving or begun  # what a command has begun is known at once
+        sensed = self._sense()
+        t, (width, force, moving, grasped) = self._disturbances.measure(*sensed)
+        moving = moving or sensed[2]  # what a command has begun is known at once
         return GripperReading(
             t=now,
             t_device=t,
@@ -234,8 +232,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._handle(active)
 
     def _before_step(self) -> None:
+        self._disturbances.update()
         if self._disturbances.active:
-            self._disturbances.deliver()
             self._disturbances.measure(*self._sense())
         if self._travel.varies and self._engaged and self._driven is not None:
             self._drive(self._driven)
@@ -255,11 +253,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def _send(self, speed: float) -> None:
         """Let the fingers go to the target, with a speed of the width, m/s, when the command arrives."""
-        if self._disturbances.active:
-            self._settle += self._disturbances.commands.steps * self._world.dt
-            self._disturbances.send(partial(self._carry_out, speed))
-        else:
-            self._carry_out(speed)
+        self._settle += self._disturbances.commands.steps * self._world.dt
+        self._disturbances.send(partial(self._carry_out, speed))
 
     def _carry_out(self, speed: float) -> None:
         self._driven = speed

@@ -114,10 +114,8 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         """Return the joints after the last physics step; ``tau`` is what the motors applied in it, Nm."""
         if not self._open or not self._connected:
             raise self._lost()
-        world, disturbances = self._world, self._disturbances
-        disturbances.update()
-        if disturbances.active:
-            disturbances.deliver()
+        world = self._world
+        self._disturbances.update()
         if self._tau is not None:
             self._keep_torques(self._tau)
         if self._freeze and self._frozen is not None:
@@ -128,9 +126,8 @@ class SimulatedRobot(RobotDriver, Generic[W]):
             if away is not None:
                 self._away = self._away or away
                 self._hold(q)
-        fault, t = self._fault or self._away or world.fault, world.t
-        if disturbances.active:
-            t, (q, dq, tau) = disturbances.measure(q, dq, tau)
+        fault = self._fault or self._away or world.fault
+        t, (q, dq, tau) = self._disturbances.measure(q, dq, tau)
         reading = Reading(now, t, world.steps, q, dq, tau, self._q, self._dq, None, None, fault)
         self._frozen = reading
         return reading

@@ -17,7 +17,7 @@ from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupp
 from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
 
-from .disturbances import Randomized
+from .disturbances import UNCHANGED, Randomized
 from .engine import AppliedForce, B, SceneEngine
 from .joints import joints_to_place, movable_joints, reset_positions
 from .states import check_state, structure_of
@@ -58,7 +58,7 @@ class SimulatedWorld(SceneEngine[B]):
         """The step after which the world was edited last."""
         self.began_at = 0
         """The step of the newest reset or edit of bodies: what was before is another scene."""
-        self.randomized = Randomized({}, 0)
+        self.randomized = UNCHANGED
         """What ``rig.world.randomize`` applied last."""
         self._forces: list[AppliedForce[B]] = []
         """Forces on links that act in the coming step."""
@@ -409,7 +409,7 @@ class SimulatedWorld(SceneEngine[B]):
     def randomize(self, values: Mapping[str, Any], seed: int) -> int:
         """Take the values that drivers, cameras and pictures read (see :mod:`hal.randomization`); return the revision.
         """
-        self.randomized = Randomized(dict(values), seed)
+        self.randomized = Randomized.take(values, seed)
         return self._edited("randomize", values=dict(values), seed=seed)
 
     def _edited(self, method: str, **params: Any) -> int:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CommandError, MotionStopped
 from ..geometry import Pose
+from ..randomization import list_distractors
 from ..specs import BodySpec, RangesSpec
 
 if TYPE_CHECKING:
@@ -128,13 +129,14 @@ def sample_poses(rig: Rig, random: np.random.Generator, given: Collection[str] =
     if plan is None or not rig.has_world:
         return {}
     there = set(rig.world.bodies) - {robot.name for robot in plan.robots}
-    drawn = [(body, body.random) for body in plan.bodies if body.random and body.name in there - set(given)]
+    known = (*plan.bodies, *list_distractors(plan))
+    drawn = [(body, body.random) for body in known if body.random and body.name in there - set(given)]
     if not drawn:
         return {}
-    free = {body.name for body in plan.bodies if body.robot is not None or not (body.collision or body.urdf)}
+    free = {body.name for body in known if body.robot is not None or not (body.collision or body.urdf)}
     rest = sorted(there - free - {body.name for body, _ in drawn})
     still = {name: solid for name in rest if (solid := _find_solid(rig.world, name)) is not None}
-    home = {body.name: still[body.name] for body in plan.bodies if body.name in still and body.name not in given}
+    home = {body.name: still[body.name] for body in known if body.name in still and body.name not in given}
     movers = [_make_random_body(rig.world, body, ranges, None if body.name in free else home) for body, ranges in drawn]
     for _ in range(_ROUNDS):
         try:
@@ -246,6 +248,7 @@ def reset_scene(
     *,
     poses: Mapping[str, Pose] | None = None,
     random: np.random.Generator | None = None,
+    seed: int | None = None,
     deadman: Deadman | None = None,
     unattended: bool = False,
     since: int | None = None,
@@ -253,6 +256,8 @@ def reset_scene(
     open_gripper: bool = True,
 ) -> dict[str, Pose]:
     """Bring a scene to its start: objects at their start poses and the arm at its start position.
+
+    Where the rig file has ``simulation.randomize``, the scene is varied, too (:meth:`hal.world.World.randomize`).
 
     A simulated arm is placed. Any other arm **drives** as ``move_to`` does, then opens its gripper. With a dead-man
     that takes a new press: a press that began before this call, or that followed a stop, does not start the motion.
@@ -263,7 +268,8 @@ def reset_scene(
         q: Its start position (n,), rad; None for its initial position in a simulated world, else home.
         poses: Poses of objects in the world, instead of sampled ones.
         random: Sample poses of objects with random ranges, see :func:`sample_poses`; None leaves them where they are
-            configured.
+            configured, and the scene as the rig file has it.
+        seed: Seed of what ``simulation.randomize`` varies; None samples one from ``random``.
         deadman: Dead-man for a real arm.
         unattended: Let a real arm drive without a dead-man.
         since: Count of presses that a new press must exceed; None for the count at this call.
@@ -288,6 +294,10 @@ def reset_scene(
             robot.gripper.open()
     if not rig.has_world:
         return {}
+    if rig.plan.world is not None and rig.plan.world.randomize is not None:
+        if seed is None and random is not None:
+            seed = int(random.integers(2**32))
+        rig.world.randomize(seed)
     rig.world.reset()
     put = dict(poses or {})
     for name, pose in put.items():
