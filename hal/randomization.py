@@ -61,9 +61,7 @@ def draw_values(spec: RandomizeSpec, seed: int) -> dict[str, Any]:
             drawn[variation.key] = numbers if len(numbers) > 1 else numbers[0]
     lights = drawn.get(COUNT, 1)
     gone = tuple(f"objects.{body.name}." for body in spec.distractors if body.name not in drawn[DISTRACTORS])
-    return {
-        key: value for key, value in drawn.items() if _light_number(key) < lights and not key.startswith(gone)
-    }
+    return {key: value for key, value in drawn.items() if _light_number(key) < lights and not key.startswith(gone)}
 
 
 def _light_number(key: str) -> int:

@@ -159,8 +159,8 @@ class Exposure:
 class PictureNoise:
     """Normal noise of pictures; of depth it grows with the square of the distance, as that of stereo cameras does.
 
-    Drawing a number for each pixel would take longer than drawing the picture: the noise is a part of one long sequence,
-    which begins elsewhere for each picture.
+    Drawing a number for each pixel would take longer than drawing the picture: the noise is a part of one long
+    sequence, which begins elsewhere for each picture.
 
     Args:
         light: Standard deviation of colour and infrared, as a share of white.

@@ -1,8 +1,8 @@
 """Light, shadows and background of drawn pictures: what is drawn beside the bodies of a scene.
 
-The first light casts shadows, by a shadow map: the depths of all that is drawn, as seen from the light. It is drawn once
-for each state of the world, whatever the number of cameras, from shapes with few triangles, because OpenGL without a
-graphics card needs time for each of them.
+The first light casts shadows, by a shadow map: the depths of all that is drawn, as seen from the light. It is drawn
+once for each state of the world, whatever the number of cameras, from shapes with few triangles, because OpenGL without
+a graphics card needs time for each of them.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ class ShadowMap:
         self.offset = 0.0
         """Distance from a surface at which its shadow is looked up, m."""
 
-    def draw(self, key: tuple[Any, ...], direction: Array, casters: Iterable[Any], frames: Array, balls: Array) -> Array:
+    def draw(
+        self, key: tuple[Any, ...], direction: Array, casters: Iterable[Any], frames: Array, balls: Array
+    ) -> Array:
         """Draw the depths, unless they are those of ``key``; return the matrix (4, 4) from the world to the map, 0..1.
 
         Args:

@@ -192,8 +192,8 @@ class GLRenderer(Renderer):
         look = self._scene.look
         streams = tuple(name for name in _OUTPUTS if name in camera.streams)
         target = self._target(camera.width, camera.height, streams)
-        T_camera_world = np.linalg.inv(T_world_camera.matrix())
-        frames = self._scene.link_frames(self._links)
+        T_camera_world: Array = np.linalg.inv(T_world_camera.matrix())
+        frames: Array = self._scene.link_frames(self._links)
         model_view = (T_camera_world @ frames)[self._link_of]
         to_clip = _projection(camera)
         # Large distances are multiplied here in double precision, not in the shader.
@@ -225,7 +225,13 @@ class GLRenderer(Renderer):
         return target.read()
 
     def _light(
-        self, look: Look, streams: tuple[str, ...], camera: CameraSpec, frames: Array, T_camera_world: Array, gain: float
+        self,
+        look: Look,
+        streams: tuple[str, ...],
+        camera: CameraSpec,
+        frames: Array,
+        T_camera_world: Array,
+        gain: float,
     ) -> tuple[str, ...]:
         """Draw the shadow map and set everything that does not differ between parts; return the kind of programs."""
         key, *fills = look.lights[: FILLS + 1] or (Light(color=(0.0, 0.0, 0.0)),)

@@ -407,8 +407,7 @@ class SimulatedWorld(SceneEngine[B]):
         return self._edited("set_color", name=name, rgba=color)
 
     def randomize(self, values: Mapping[str, Any], seed: int) -> int:
-        """Take the values that drivers, cameras and pictures read (see :mod:`hal.randomization`); return the revision.
-        """
+        """Take the values that devices and pictures read (see :mod:`hal.randomization`) and return the new revision."""
         self.randomized = Randomized.take(values, seed)
         return self._edited("randomize", values=dict(values), seed=seed)
 

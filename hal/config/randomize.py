@@ -37,7 +37,8 @@ def _check_count(value: Any) -> Any:
 def _check_colors(value: tuple[_Two, ...]) -> tuple[_Two, ...]:
     for name, least, greatest in zip(("red", "green", "blue"), *value, strict=True):
         if least > greatest:
-            raise ValueProblem(f"must be {ENDS} [red, green, blue]; {name} {least:g} is above {greatest:g}", "empty_range")
+            text = f"must be {ENDS} [red, green, blue]; {name} {least:g} is above {greatest:g}"
+            raise ValueProblem(text, "empty_range")
     return value
 
 

@@ -63,9 +63,8 @@ def resolve_randomize(
         return None
     links = {body.name: _links_of(body) for body in (*bodies, *distractors)}
     for robot in robots:
-        others = context.links.get(robot.name, {})
-        links[robot.name] = dict.fromkeys(context.urdfs[robot.name].links) | others
-        links[robot.name] = {name: real or name for name, real in links[robot.name].items()}
+        own = {name: name for name in context.urdfs[robot.name].links}
+        links[robot.name] = own | context.links.get(robot.name, {})
     names = [body.name for body in (*bodies, *distractors)]
     for name, key, own in _entries(context, "objects", config.objects, names):
         found += _body(context, f"objects.{name}", key, own, links[name])

@@ -26,20 +26,24 @@ cameras:
 objects: [floor, table, cube]
 simulation:
   randomize:
-    light: {count: [1, 3], azimuth_deg: [-180, 180], elevation_deg: [30, 80], intensity: [0.7, 1.5], ambient: [0.6, 1.2]}
+    light: {count: [1, 3], azimuth_deg: [-180, 180], elevation_deg: [30, 80], intensity: [0.7, 1.5], ambient: [0.6, 1]}
     background: {color: [[0.2, 0.2, 0.2], [1, 1, 1]], texture: [none, marble, wall.png]}
     objects:
       "*": {color: [[0.1, 0.1, 0.1], [1, 1, 1]], texture: [none, checker, wood]}
       cube: {color: [[0.5, 0, 0], [1, 0.2, 0.2]], mass_scale: [0.5, 2], friction_scale: [0.7, 1.3]}
     robots:
-      panda: {links: {hand: {color: [[0, 0, 0], [1, 1, 1]]}}, command_latency_s: [0.01, 0.03], position_noise: [0, 1e-4]}
+      panda:
+        links: {hand: {color: [[0, 0, 0], [1, 1, 1]]}}
+        command_latency_s: [0.01, 0.03]
+        position_noise: [0, 1e-4]
     cameras:
       scene: {position_m: [-0.02, 0.02], rotation_deg: [-2, 2], field_of_view_scale: [0.9, 1.1], exposure: [0.7, 1.3],
               color_noise: [0, 0.03], depth_noise: [0, 0.004]}
     distractors:
       objects:
-        - {name: ball, shape: sphere, radius: 0.03, mass: 0.1, position: [0.2, 0.3, 0.655], random: {x: [0.1, 0.3], y: [0.2, 0.4]}}
-        - {name: can, shape: cylinder, radius: 0.03, length: 0.1, mass: 0.3, position: [0.2, -0.3, 0.675], random: {x: [0.1, 0.3], y: [-0.4, -0.2]}}
+        - {name: ball, shape: sphere, radius: 0.03, mass: 0.1, position: [0.2, 0.3, 0.655], random: {x: [0.1, 0.3]}}
+        - {name: can, shape: cylinder, radius: 0.03, length: 0.1, mass: 0.3, position: [0.2, -0.3, 0.675],
+           random: {x: [0.1, 0.3], y: [-0.4, -0.2]}}
       count: [1, 2]
 """
 ENGINES = ("mujoco", "pybullet")
