@@ -169,7 +169,10 @@ class PictureNoise:
 
     def __init__(self, light: float, depth: float) -> None:
         self._light, self._depth = light, depth
-        self._scaled: dict[int, NDArray[np.int16]] = {}
+        self._lighter: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
+        """What pictures of a size get added, and taken away."""
+        self._farther: dict[int, Image] = {}
+        """Noise of depth pictures of a size at 1 m, m."""
         self.active = light > 0.0 or depth > 0.0
         """Whether there is any."""
 
@@ -179,21 +182,28 @@ class PictureNoise:
         """Return a picture of any shape with noise; ``random`` chooses it."""
         if picture is None or random is None or not self._light:
             return picture
-        if picture.size not in self._scaled:
-            scaled = np.rint(255.0 * self._light * _normal_numbers(picture.size))
-            self._scaled[picture.size] = scaled.astype(np.int16)
-        start = int(random.integers(_STARTS))
-        noisy = picture.ravel() + self._scaled[picture.size][start : start + picture.size]
-        return np.clip(noisy, 0, 255, out=noisy).astype(np.uint8).reshape(picture.shape)
+        size, start = picture.size, int(random.integers(_STARTS))
+        if size not in self._lighter:
+            scaled = np.clip(np.rint(255.0 * self._light * _normal_numbers(size)), -255, 255).astype(np.int16)
+            self._lighter[size] = np.maximum(scaled, 0).astype(np.uint8), np.maximum(-scaled, 0).astype(np.uint8)
+        more, less = (part[start : start + size].reshape(picture.shape) for part in self._lighter[size])
+        noisy = np.minimum(picture, 255 - more)  # nothing overflows, without a wider type, which would take longer
+        noisy += more
+        np.maximum(noisy, less, out=noisy)
+        noisy -= less
+        return noisy
 
     def blur_depth(self, depth: Image | None, random: np.random.Generator | None) -> Image | None:
         """Return depth (H, W), m, with noise where there is depth."""
         if depth is None or random is None or not self._depth:
             return depth
-        start = int(random.integers(_STARTS))
-        noise = _normal_numbers(depth.size)[start : start + depth.size].reshape(depth.shape)
-        noisy: Image = np.maximum(depth + np.float32(self._depth) * depth * depth * noise, 0.0)
-        return noisy
+        size, start = depth.size, int(random.integers(_STARTS))
+        if size not in self._farther:
+            self._farther[size] = np.float32(self._depth) * _normal_numbers(size)
+        noisy: Image = depth * depth
+        noisy *= self._farther[size][start : start + size].reshape(depth.shape)
+        noisy += depth
+        return np.maximum(noisy, 0.0, out=noisy)
 
 
 _STARTS = 1 << 16

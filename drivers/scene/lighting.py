@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BACKGROUND", "FILLS", "Backdrop", "Light", "Look", "ShadowMap"]
+__all__ = ["BACKGROUND", "Backdrop", "Light", "Look", "ShadowMap"]
 
 Array = NDArray[np.float64]
 
 BACKGROUND = (0.72, 0.76, 0.80)
 """Colour of the background."""
-FILLS = 2
-"""Greatest number of lights without shadows, beside the first one."""
 _SIDE = 768
 """Side of the shadow map, texels."""
 _WIDEST = 2.0
@@ -51,7 +49,8 @@ class Look:
     """How a scene looks, apart from its bodies."""
 
     lights: tuple[Light, ...] = (Light(),)
-    """The first one casts shadows."""
+    """The first one casts shadows. The others are soft, as from a large window: they also light what is turned away
+    from them, half as much at a right angle."""
     ambient: float = 1.0
     """Light from everywhere, as a factor of the default."""
     background: tuple[float, ...] = BACKGROUND
@@ -133,7 +132,9 @@ class ShadowMap:
             mesh = drawable.part.mesh
             points = _coarsen(mesh.positions, mesh.faces, drawable.part.radius / _CELLS)
             buffer = self._context.buffer(points.tobytes())
-            known = drawable.arrays["shadow"] = self._context.vertex_array(self._program, [(buffer, "3f4", "position")])
+            content = [(buffer, "3f4", "position")]
+            known = drawable.arrays["shadow"] = self._context.vertex_array(self._program, content)
+            drawable.buffers.append(buffer)
         return known
 
     def use(self, place: int) -> None:
@@ -171,17 +172,17 @@ class Backdrop:
         self._array = context.vertex_array(self._program, [])
 
     def draw(self, target: Any, texture: Any, rays: Array, tint: Array, grey: bool) -> None:
-        """Draw it into all of a framebuffer.
+        """Draw it where nothing else was drawn.
 
         Args:
-            target: The framebuffer of one layer.
+            target: The framebuffer of one layer, with the depths of what was drawn.
             texture: The picture.
             rays: (3, 3) from the position in the picture (-1..1, -1..1, 1) to the direction in the world.
             tint: (3,) factors on red, green and blue.
             grey: Whether only the luminance is drawn.
         """
         target.use()
-        self._context.enable_only(0)
+        self._context.enable_only(self._context.DEPTH_TEST)
         self._program["rays"].write(np.ascontiguousarray(rays.T, np.float32))
         self._program["tint"].value = tuple(tint.tolist())
         self._program["grey"].value = grey
@@ -195,7 +196,7 @@ out vec3 ray;
 void main() {
     vec2 at = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
     ray = rays * vec3(at, 1.0);
-    gl_Position = vec4(at, 0.0, 1.0);
+    gl_Position = vec4(at, 0.99999, 1.0);
 }
 """
 
@@ -206,9 +207,9 @@ uniform bool grey;
 in vec3 ray;
 out vec4 color;
 void main() {
-    vec3 d = normalize(ray);
-    vec2 at = vec2(0.6366 * atan(d.y, d.x), 0.6366 * asin(clamp(d.z, -1.0, 1.0)));
-    vec3 seen = textureLod(picture, 2.0 * at, 0.0).rgb * tint;
+    vec3 far = abs(ray);  // on a cube around the camera
+    vec2 at = far.x > max(far.y, far.z) ? ray.yz / ray.x : far.y > far.z ? ray.xz / ray.y : ray.xy / ray.z;
+    vec3 seen = textureLod(picture, at, 0.0).rgb * tint;
     color = grey ? vec4(dot(seen, vec3(0.299, 0.587, 0.114))) : vec4(seen, 1.0);
 }
 """

@@ -20,7 +20,7 @@ from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
-from .lighting import BACKGROUND, FILLS, Backdrop, Light, Look, ShadowMap
+from .lighting import BACKGROUND, Backdrop, Light, Look, ShadowMap
 from .meshes import MeshLibrary
 from .shapes import DrawnPart, RenderScene, Visual, parts_of
 from .textures import load_texture
@@ -81,6 +81,8 @@ class _Drawable(NamedTuple):
     texture: Any
     arrays: dict[tuple[str, ...] | str, Any]
     """Its vertex array for each program."""
+    buffers: list[Any]
+    """Further buffers that its arrays use."""
 
 
 class _Body(NamedTuple):
@@ -174,17 +176,19 @@ class GLRenderer(Renderer):
         if mesh.texture is not None and mesh.uv is not None:
             columns.append(mesh.uv)
             layout = ("3f4 3f4 4f1 2f4", "position", "normal", "color", "uv")
-            texture = self._texture(mesh.texture)
+            texture = self._texture(mesh.texture, repeated=mesh.repeated)
         rows = np.concatenate([np.ascontiguousarray(c).view(np.uint8).reshape(len(c), -1) for c in columns], axis=1)
         vertices = self._context.buffer(rows.tobytes())
         indices = self._context.buffer(np.ascontiguousarray(mesh.faces, np.uint32).tobytes())
-        return _Drawable(part, vertices, indices, layout, texture, {})
+        return _Drawable(part, vertices, indices, layout, texture, {}, [])
 
-    def _texture(self, image: NDArray[np.uint8]) -> Any:
+    def _texture(self, image: NDArray[np.uint8], repeated: bool) -> Any:
         if id(image) not in self._textures:
             height, width = image.shape[:2]
             texture = self._context.texture((width, height), 3, image[::-1].tobytes(), alignment=1)
             texture.build_mipmaps()
+            if repeated:  # these cover most of a picture: sharper edges are nearly free, smooth ones take a fifth more
+                texture.filter = self._context.NEAREST_MIPMAP_NEAREST, self._context.NEAREST
             self._textures[id(image)] = (texture, image)  # the image is kept, so that its id stays its own
         return self._textures[id(image)][0]
 
@@ -192,7 +196,7 @@ class GLRenderer(Renderer):
         look = self._scene.look
         streams = tuple(name for name in _OUTPUTS if name in camera.streams)
         target = self._target(camera.width, camera.height, streams)
-        T_camera_world: Array = np.linalg.inv(T_world_camera.matrix())
+        T_camera_world: Any = np.linalg.inv(T_world_camera.matrix())
         frames: Array = self._scene.link_frames(self._links)
         model_view = (T_camera_world @ frames)[self._link_of]
         to_clip = _projection(camera)
@@ -203,8 +207,6 @@ class GLRenderer(Renderer):
         exposure = look.exposure.get(camera.name, 1.0)
         variant = self._light(look, streams, camera, frames, T_camera_world, exposure)
         target.clear(np.clip(exposure * np.array(look.background), 0.0, 1.0))
-        if look.backdrop:
-            self._draw_backdrop(look, target, to_clip[:2, :3], T_world_camera, exposure)
         target.use()
         for number in self._visible(camera, model_view):
             drawable = self._drawables[number]
@@ -222,6 +224,8 @@ class GLRenderer(Renderer):
                 self._context.DEPTH_TEST | (self._context.CULL_FACE if drawable.part.mesh.closed else 0)
             )
             self._array(drawable, (*streams, *key), program).render()
+        if look.backdrop:
+            self._draw_backdrop(look, target, to_clip[:2, :3], T_world_camera, exposure)
         return target.read()
 
     def _light(
@@ -234,7 +238,7 @@ class GLRenderer(Renderer):
         gain: float,
     ) -> tuple[str, ...]:
         """Draw the shadow map and set everything that does not differ between parts; return the kind of programs."""
-        key, *fills = look.lights[: FILLS + 1] or (Light(color=(0.0, 0.0, 0.0)),)
+        key, *fills = look.lights or (Light(color=(0.0, 0.0, 0.0)),)
         lit = bool({"color", "infrared"} & set(streams))
         values: dict[str, Any] = {
             "key_light": T_camera_world[:3, :3] @ _unit(key.direction),
@@ -244,10 +248,15 @@ class GLRenderer(Renderer):
             "ambience": look.ambient,
             "exposure": gain,
         }
-        for k, light in enumerate(fills):
-            values[f"fill_light_{k}"] = T_camera_world[:3, :3] @ _unit(light.direction)
-            values[f"fill_color_{k}"] = light.color
-        variant = tuple(f"fill_{k}" for k in range(len(fills)))
+        variant: tuple[str, ...] = ()
+        if fills:
+            variant = ("fill",)
+            # Half from everywhere, half by the side that a surface has towards the light; and the ambient light, too.
+            colors = 0.5 * _KEY * np.array([light.color for light in fills])
+            directions = np.array([T_camera_world[:3, :3] @ _unit(light.direction) for light in fills])
+            low, high = 0.5 * look.ambient * np.array(_AMBIENT)
+            by_side = colors.T @ directions + np.outer(high - low, T_camera_world[:3, 2])
+            values |= {"fill": colors.sum(axis=0) + low + high, "fill_by_side": by_side.T.ravel()}
         if look.shadows and lit:
             variant += ("shadows",)
             to_light = self._draw_shadows(_unit(key.direction), frames) @ np.linalg.inv(T_camera_world)
@@ -277,7 +286,7 @@ class GLRenderer(Renderer):
             self._backdrop = Backdrop(self._context)
         inverse = np.linalg.inv(np.vstack([lens, [0.0, 0.0, 1.0]]))
         rays = pose.matrix()[:3, :3] @ inverse
-        texture = self._texture(load_texture(look.backdrop))
+        texture = self._texture(load_texture(look.backdrop), repeated=True)
         for name, layer in target.layers():
             self._backdrop.draw(layer, texture, rays, gain * np.array(look.background), name == "infrared")
 
@@ -338,8 +347,8 @@ def _release(body: _Body | None) -> None:
     for drawable in body.drawables if body else ():
         for array in drawable.arrays.values():
             array.release()
-        drawable.vertices.release()
-        drawable.indices.release()
+        for buffer in (drawable.vertices, drawable.indices, *drawable.buffers):
+            buffer.release()
 
 
 # --- where OpenGL draws to --------------------------------------------------------------------------------------------
@@ -386,6 +395,11 @@ class _Target:
         self._depth = context.framebuffer([], depth)
         self._all = context.framebuffer(layers, depth)
         self._each = [context.framebuffer([layer]) for layer in layers]
+        self._lit = {
+            name: context.framebuffer([layer], depth)
+            for name, layer in zip(streams, layers, strict=True)
+            if name in ("color", "infrared")
+        }
 
     def clear(self, background: Array) -> None:
         """Clear all layers; ``background`` (3,) is the colour of the background, 0..1."""
@@ -396,10 +410,8 @@ class _Target:
         self._depth.clear(depth=1.0)
 
     def layers(self) -> Iterator[tuple[str, Any]]:
-        """Yield the framebuffer of each layer that shows light."""
-        for name, layer in zip(self._streams, self._each, strict=True):
-            if name in ("color", "infrared"):
-                yield name, layer
+        """Yield the framebuffer of each layer that shows light, with the depths of what was drawn."""
+        yield from self._lit.items()
 
     def use(self) -> None:
         """Draw into all layers."""
@@ -464,6 +476,11 @@ _OUTPUTS = {
 }
 """How each stream is drawn; their order is that of the layers. The background of light is that of the scene's look."""
 
+_KEY = 0.36
+"""Share of the light that comes from the first light."""
+_AMBIENT = (0.34, 0.32, 0.31), (0.52, 0.54, 0.57)
+"""Light from everywhere on what faces downwards, and upwards."""
+
 _VERTEX = """
 #if defined(COLOR) || defined(INFRARED)
 #define LIT
@@ -503,7 +520,11 @@ void main() {
 }
 """
 
-_FRAGMENT = """
+_FRAGMENT = f"""
+#define KEY {_KEY}
+#define LOW vec3{_AMBIENT[0]}
+#define HIGH vec3{_AMBIENT[1]}
+""" + """
 #if defined(COLOR) || defined(INFRARED)
 #define LIT
 #endif
@@ -513,13 +534,9 @@ uniform vec3 key_color;
 uniform vec3 up;
 uniform float ambience;
 uniform float exposure;
-#ifdef FILL_0
-uniform vec3 fill_light_0;
-uniform vec3 fill_color_0;
-#endif
-#ifdef FILL_1
-uniform vec3 fill_light_1;
-uniform vec3 fill_color_1;
+#ifdef FILL
+uniform vec3 fill;
+uniform mat3 fill_by_side;
 #endif
 #ifdef SHADOWS
 uniform sampler2DShadow shadow_map;
@@ -547,7 +564,6 @@ void main() {
 #ifdef TEXTURED
     base *= texture(picture, place).rgb;
 #endif
-    vec3 ambient = mix(vec3(0.34, 0.32, 0.31), vec3(0.52, 0.54, 0.57), 0.5 + 0.5 * dot(n, up));
     float side = max(dot(n, key_light), 0.0);
     float head = 0.12 * max(dot(n, eye), 0.0);
     float gloss = 0.05 * pow(max(dot(n, normalize(key_light + eye)), 0.0), 24.0);
@@ -556,13 +572,12 @@ void main() {
     if (side > 0.0 && all(lessThan(abs(in_light - 0.5), vec3(0.5))))
         lit = texture(shadow_map, in_light);
 #endif
-    vec3 light = ambience * (ambient + head) + lit * 0.36 * side * key_color;
-#ifdef FILL_0
-    light += 0.36 * max(dot(n, fill_light_0), 0.0) * fill_color_0;
+#ifdef FILL
+    vec3 around = fill + fill_by_side * n + ambience * head;
+#else
+    vec3 around = ambience * (mix(LOW, HIGH, 0.5 + 0.5 * dot(n, up)) + head);
 #endif
-#ifdef FILL_1
-    light += 0.36 * max(dot(n, fill_light_1), 0.0) * fill_color_1;
-#endif
+    vec3 light = around + lit * KEY * side * key_color;
     vec3 seen = exposure * (base * light + lit * gloss * key_color);
 #endif
 #ifdef COLOR

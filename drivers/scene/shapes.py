@@ -112,6 +112,8 @@ class Mesh:
     """(V, 2) texture coordinates, (0, 0) at the lower left."""
     texture: NDArray[np.uint8] | None = None
     """(H, W, 3) RGB, first row at the top."""
+    repeated: bool = False
+    """Whether the texture is a pattern that covers the mesh again and again."""
     material: bool = True
     """Whether the colours come from the file's materials, which a colour from the URDF replaces; a texture it tints."""
     closed: bool = True
@@ -168,6 +170,7 @@ class Mesh:
             faces=np.arange(3 * len(self.faces), dtype=np.uint32).reshape(-1, 3),
             uv=uv.astype(np.float32),
             texture=texture,
+            repeated=True,
         )
 
     def tinted(self, rgba: tuple[float, ...]) -> Mesh:
