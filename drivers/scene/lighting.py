@@ -20,11 +20,11 @@ Array = NDArray[np.float64]
 
 BACKGROUND = (0.72, 0.76, 0.80)
 """Colour of the background."""
-_SIDE = 768
+_SIDE = 512
 """Side of the shadow map, texels."""
 _WIDEST = 2.0
-"""Greatest radius of the space in which shadows are drawn, m: its texels are 5 mm large."""
-_CELLS = 10
+"""Greatest radius of the space in which shadows are drawn, m: its texels are 8 mm large."""
+_CELLS = 6
 """Size of the details of a part that its shadow has, as a share of the part's radius: one of so many."""
 _STEP = 0.25
 """The space of the shadows grows and moves in steps of this size, m, so that their edges stand still."""

@@ -520,11 +520,13 @@ void main() {
 }
 """
 
-_FRAGMENT = f"""
+_FRAGMENT = (
+    f"""
 #define KEY {_KEY}
 #define LOW vec3{_AMBIENT[0]}
 #define HIGH vec3{_AMBIENT[1]}
-""" + """
+"""
+    + """
 #if defined(COLOR) || defined(INFRARED)
 #define LIT
 #endif
@@ -595,3 +597,4 @@ void main() {
 #endif
 }
 """
+)
