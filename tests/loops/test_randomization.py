@@ -172,3 +172,19 @@ def test_sensors_and_commands_are_as_late_as_was_asked(late: hal.Rig) -> None:
     state = arm.state()
     assert state.stamp.t == pytest.approx(state.stamp.t_device)
     assert late.cameras["eye"].read().stamp.t == pytest.approx(late.clock.now())
+
+
+def test_an_environment_varies_with_the_seed_of_its_reset(rig_file: Path) -> None:
+    gym = pytest.importorskip("hal.gym", reason="pip install 'robot-hal[gym]'")
+    env = gym.RigEnv(rig_file, sim=True, engine=ENGINES[0])
+    try:
+        first, info = env.reset(seed=3)
+        drawn = info["randomization"]
+        assert drawn["seed"] == 3
+        _, following = env.reset()
+        assert following["randomization"]["values"] != drawn["values"], "the next episode is another scene"
+        again, info = env.reset(seed=3)
+        assert info["randomization"] == drawn
+        assert all(np.array_equal(again[key], value) for key, value in first.items())
+    finally:
+        env.close()
