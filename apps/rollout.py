@@ -441,7 +441,9 @@ class RolloutRun:
                 held = f"; release {self.button}, then hold it until the arm is there" if self.button else ""
                 self._announce(f"episode {number}: {robot.name} drives home, then its gripper opens{held}")
             objects = random if count == len(self.robots) else None  # every reset of an arm puts the objects back
-            put = reset_scene(rig, robot, random=objects, deadman=self.deadman, unattended=self.args.unattended)
+            varied = None if objects is None else seed
+            free = self.args.unattended
+            put = reset_scene(rig, robot, random=objects, seed=varied, deadman=self.deadman, unattended=free)
         if self.reset_function is not None:
             self.reset_function(rig, random)
         elif put:

@@ -91,6 +91,11 @@ class Camera:
             self._thread = threading.Thread(target=self._run, name=f"hal-camera-{self.name}", daemon=True)
             self._thread.start()
 
+    def refresh_info(self) -> None:
+        """Take over the calibration of the driver, which has changed."""
+        with self._news:
+            self._info = self._driver.info
+
     @property
     def info(self) -> CameraInfo:
         """Serial number, calibration of every stream, link and options, read when the camera was opened."""

@@ -155,7 +155,7 @@ class Rig:
             self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
         self._wait_for_hosts(realtime)
         if world_host is not None:
-            self.world = World(world_host.request, partial(self._pass_on_edit, world_host))
+            self.world = World(world_host.request, partial(self._pass_on_edit, world_host), self.plan.world)
         for host in self._hosts:
             self.notes.extend(host.request("warnings"))
             for spec in host.spec.robots:
@@ -430,6 +430,10 @@ class Rig:
             if shown is not None:
                 with contextlib.suppress(ConnectionLost):  # its own next use raises the error
                     shown.edited(method, params, revision)
+        if method == "randomize" and self._pictures is not None:
+            for name in self._pictures.cameras:
+                self._devices[name].vary(params["values"])
+                self.cameras[name].refresh_info()
 
     def close(self) -> None:
         """Bring the arms to rest and release every device. Idempotent; the first error is raised at the end."""

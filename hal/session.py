@@ -280,7 +280,7 @@ class TeleopSession:
         or before a stop, does not count. At home its gripper opens.
 
         Args:
-            seed: Seed of the poses of objects with random ranges.
+            seed: Seed of the poses of objects with random ranges, and of what ``simulation.randomize`` varies.
             keep_waiting: Called ten times a second while the dead-man is released; False cancels.
 
         Returns:
@@ -471,6 +471,7 @@ class TeleopSession:
                 self.rig,
                 robot,
                 random=np.random.default_rng(seed),
+                seed=seed,
                 deadman=deadman,
                 since=since,
                 patience=HOMING_PATIENCE,

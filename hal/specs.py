@@ -27,9 +27,11 @@ __all__ = [
     "PadSpec",
     "PayloadSpec",
     "Plan",
+    "RandomizeSpec",
     "RangesSpec",
     "RobotSpec",
     "SensorSpec",
+    "VariationSpec",
     "ViewSpec",
     "WorkspaceSpec",
     "WorldSpec",
@@ -403,6 +405,28 @@ class GroupSpec:
 
 
 @dataclass(frozen=True)
+class VariationSpec:
+    """A range that a value of the scene is drawn from."""
+
+    key: str
+    """Key of the value, as in the section ``simulation.randomize`` of the rig's file."""
+    lower: Floats = ()
+    """Least values, one for each number of the value."""
+    upper: Floats = ()
+    choices: tuple[str, ...] = ()
+    """What a text is chosen from; empty for numbers."""
+
+
+@dataclass(frozen=True)
+class RandomizeSpec:
+    """What varies in a simulated world from episode to episode: see :mod:`hal.randomization`."""
+
+    variations: tuple[VariationSpec, ...]
+    distractors: tuple[BodySpec, ...] = ()
+    """Objects that are only there if they are drawn."""
+
+
+@dataclass(frozen=True)
 class WorldSpec:
     """The simulated world of a rig."""
 
@@ -412,6 +436,10 @@ class WorldSpec:
     bodies: tuple[BodySpec, ...]
     robots: tuple[RobotSpec, ...]
     """Every arm in the world."""
+    shadows: bool = True
+    """Whether pictures have shadows."""
+    randomize: RandomizeSpec | None = None
+    """What varies; None if nothing does."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import zlib
 from abc import ABC, abstractmethod
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import CommandError, NotSupported
 from .geometry import Pose, freeze
+from .randomization import Randomizer
 from .specs import BodySpec, WorldSpec, from_json, to_json
 
 __all__ = ["BodyJoint", "Contact", "Contacts", "NoWorld", "Poses", "RayHit", "World", "WorldDriver", "WorldState"]
@@ -122,11 +124,18 @@ class World:
         request: Sends a request to the process of the simulation.
         edited: Called after every edit that changes what is drawn, with the method, its parameters and the new
             revision.
+        spec: Record of the world; None for one that varies nothing.
     """
 
-    def __init__(self, request: Callable[[str, dict[str, Any]], Any], edited: Callable[[str, Any, int], None]) -> None:
+    def __init__(
+        self,
+        request: Callable[[str, dict[str, Any]], Any],
+        edited: Callable[[str, Any, int], None],
+        spec: WorldSpec | None = None,
+    ) -> None:
         self._request = request
         self._edited = edited
+        self._randomizer = Randomizer(spec)
 
     def _call(self, method: str, **params: Any) -> Any:
         return self._request(f"world.{method}", params)
@@ -164,6 +173,34 @@ class World:
             rgba: Red, green, blue and opacity, 0..1.
         """
         self._edit("set_color", name=name, rgba=[float(value) for value in rgba])
+
+    def randomize(self, seed: int | Mapping[str, Any] | None = None) -> dict[str, Any] | None:
+        """Vary the scene as ``simulation.randomize`` of the rig file says: looks, cameras, physics, delays and noise.
+
+        Poses stay; distractors that are drawn are added where they are configured. A reset of a scene, for example by
+        ``hal generate`` or :class:`hal.gym.RigEnv`, does this with the seed of the episode.
+
+        Args:
+            seed: Seed of what is drawn, the same for every engine; or :attr:`randomization` of another time, as an
+                episode has it, for the same values again; or None for those of the rig file.
+
+        Returns:
+            :attr:`randomization`.
+
+        Raises:
+            CommandError: The rig file has no ranges (``code`` is ``no_randomize``), or the record is of another one
+                (``bad_record``).
+        """
+        randomizer = self._randomizer
+        record = None if seed is None else randomizer.make_record(seed)
+        if record is not None or randomizer.record is not None:
+            self._edit("randomize", **randomizer.apply(self, record))
+        return self.randomization
+
+    @property
+    def randomization(self) -> dict[str, Any] | None:
+        """``seed`` and drawn ``values`` by key of what :meth:`randomize` applied last, as JSON; None without it."""
+        return copy.deepcopy(self._randomizer.record)
 
     def pose(self, name: str, link: str | None = None) -> Pose:
         """Return the true pose of a body in the world.
@@ -423,6 +460,7 @@ class WorldDriver(ABC):
     ``add``            ``spec``, of a :class:`.BodySpec`       the new revision
     ``remove``         ``name``                                the new revision
     ``set_color``      ``name``, ``rgba``                      the new revision
+    ``randomize``      ``values``, ``seed``                    the new revision
     ``set_pose``       ``name``, ``pose``                      none
     ``set_velocity``   ``name``, ``linear``, ``angular``       none
     ``set_joint_positions``  ``name``, ``positions``           none
@@ -447,11 +485,11 @@ class WorldDriver(ABC):
             *("names", "describe", "pose", "poses", "velocity", "dynamics", "contacts", "aabb", "ray", "distance"),
             *("joint_positions", "set_joint_positions"),
             *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "apply_force", "set_gravity"),
-            *("reset", "save", "restore"),
+            *("randomize", "reset", "save", "restore"),
         }
     )
     """Names of the requests."""
-    MIRRORED: ClassVar[frozenset[str]] = frozenset({"add", "remove", "set_color"})
+    MIRRORED: ClassVar[frozenset[str]] = frozenset({"add", "remove", "set_color", "randomize"})
     """Requests that change what is drawn beyond poses. Each one that succeeds adds one to :attr:`revision`; what draws
     the world repeats them, in their order, before it displays a snapshot of that revision."""
 

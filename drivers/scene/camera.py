@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any, ClassVar, Protocol
@@ -23,6 +23,7 @@ from hal.host.process import Channel, Child, SharedMemory, serve
 from hal.host.ring import FrameRing, frame_rings, frame_rings_size
 from hal.host.scheduling import yield_to_others
 from hal.preflight import CheckResult
+from hal.randomization import vary_camera
 from hal.specs import CameraSpec, Plan, WorldSpec, from_json, to_json
 from hal.views import CameraRenderer
 
@@ -78,6 +79,10 @@ class SimulatedCamera(CameraDriver):
         """The figures of the camera's model, by which the pictures are drawn."""
         return self._info
 
+    def vary(self, values: Mapping[str, Any]) -> None:
+        """Take the calibration that a randomization of the world gives this camera."""
+        self._info = SimulatedCamera(vary_camera(self.spec, values)).info
+
     def open(self) -> None:
         if not hasattr(self.source, "grab"):
             raise NotSupported(
@@ -104,6 +109,8 @@ class SimulatedCamera(CameraDriver):
 class DirectSource:
     """Source in lock-step: draws the present state of the world in the caller's thread, each state once.
 
+    A camera with a latency draws the state that the world had before.
+
     Args:
         mirror: What is drawn of the world.
         renderer: Draws it.
@@ -125,11 +132,13 @@ class DirectSource:
         """The newest frame, and the world's version that it shows."""
 
     def grab(self, timeout: float) -> RawFrame:
-        mirror = self._mirror
-        version = mirror.update()
+        mirror, version = self._mirror, self._mirror.world.version
         if self._newest is None or self._newest[0] != version:
             self._seq += 1
-            frame = self._exposure.capture(mirror.drawn, self._renderer, self._now(), mirror.world.t, self._seq)
+            randomized = mirror.drawn.randomized
+            shown = mirror.update(randomized.get(f"cameras.{self._exposure.spec.name}", "latency_s"))
+            t = self._now() - (mirror.world.t - shown)
+            frame = self._exposure.capture(mirror.drawn, self._renderer, t, shown, self._seq)
             self._newest = version, frame
         return self._newest[1]
 
@@ -248,6 +257,8 @@ class RenderWorker:
         self._due = {camera.name: start + k / len(cameras) / camera.rate_hz for k, camera in enumerate(cameras)}
         self._shown = dict.fromkeys(self._due, float("-inf"))
         """Time of the world in each camera's last picture, s."""
+        self._late: list[tuple[float, str, RawFrame]] = []
+        """Pictures of cameras with a latency, and when they are handed out, s on the monotonic clock."""
 
     def warm_up(self) -> None:
         """Draw every camera once, so that meshes and shaders are ready when the first snapshot comes."""
@@ -257,6 +268,9 @@ class RenderWorker:
     def run_once(self) -> float:
         """Draw the cameras that are due and return when the next one is due, s on the monotonic clock."""
         now = time.monotonic()
+        waiting, self._late = self._late, []
+        for due, name, frame in waiting:
+            self._hand_out(due, name, frame, now)
         for camera in sorted(self._cameras, key=lambda camera: self._due[camera.name]):
             if self._due[camera.name] <= now:
                 t = self._mirror.update()
@@ -265,12 +279,19 @@ class RenderWorker:
                 self._numbers[camera.name] += 1
                 number = self._numbers[camera.name]
                 frame = self._exposures[camera.name].capture(self._drawn, self._renderer, t, t, number)
-                self._rings[camera.name].write(frame)
+                latency = self._exposures[camera.name].latency
+                self._hand_out(t + latency if latency else now, camera.name, frame, time.monotonic())
                 self._shown[camera.name] = t
                 period = 1.0 / camera.rate_hz
                 late = time.monotonic() - self._due[camera.name]
                 self._due[camera.name] += period * max(1, int(late / period))  # missed pictures are left out
-        return min(self._due.values())
+        return min([*self._due.values(), *(due for due, _, _ in self._late)])
+
+    def _hand_out(self, due: float, name: str, frame: RawFrame, now: float) -> None:
+        if due <= now:
+            self._rings[name].write(frame)
+        else:
+            self._late.append((due, name, frame))
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ a picture of one state is the same picture whichever engine made it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -17,8 +18,11 @@ from numpy.typing import NDArray
 from hal.errors import ConfigError, DeviceNotFound, Problem
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfModel
+from hal.randomization import COUNT
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
+from .disturbances import UNCHANGED, Randomized
+from .lighting import BACKGROUND, Light, Look
 from .shapes import Visual
 from .urdf_files import absent_packages, checked_urdf, drawn_visuals, has_free_base, where_to_get
 from .values import body_spec, nearest
@@ -76,6 +80,9 @@ class DrawnWorld:
         self.bodies: dict[str, DrawnBody] = {}
         self.revision = 0
         """Number of edits so far, as of the world."""
+        self.look = Look(shadows=spec.shadows)
+        self.randomized = UNCHANGED
+        """What ``rig.world.randomize`` applied last."""
         self._absent: dict[str, list[str]] = {}
         """Packages of meshes that are not installed -> the bodies that need them."""
         self._numbers = count()
@@ -104,9 +111,12 @@ class DrawnWorld:
         elif method == "set_color":
             body, rgba = self.bodies[params["name"]], tuple(float(value) for value in params["rgba"])
             body.visuals = tuple(visual._replace(rgba=rgba) for visual in body.visuals)
+        elif method == "randomize":
+            self.randomized = Randomized.take(params["values"], params["seed"])
+            self.look = _make_look(params["values"], self.spec.shadows)
         else:
             raise ValueError(f"{method} is no edit of what is drawn")
-        if method != "set_color":
+        if method in ("add", "remove"):
             self._arrange()
         self.revision += 1
         return self.revision
@@ -263,7 +273,15 @@ class DrawnWorld:
 
     def visuals(self, body: int) -> tuple[Visual, ...]:
         """Return the visual shapes of the body with this id."""
-        return self._by_id[body].visuals
+        shown = self._by_id[body]
+        section = f"{'robots' if isinstance(shown.spec, RobotSpec) else 'objects'}.{shown.name}"
+        if not any(key.startswith(f"{section}.") for key in self.randomized.values):
+            return shown.visuals
+        names = {number: name for name, number in shown.links.items()}
+        return tuple(
+            _dress(visual, self.randomized.values, section, f"{section}.links.{names[visual.link]}")
+            for visual in shown.visuals
+        )
 
     def link_frames(self, links: Sequence[tuple[int, int]]) -> Array:
         """Return the poses (N, 4, 4) in the world of the frames of links, each given as (body id, link)."""
@@ -350,6 +368,44 @@ def _primitive(spec: BodySpec) -> tuple[Visual, ...]:
     elif shape == "mesh":
         size = (spec.scale,) * 3
     return (Visual(0, shape, size, spec.mesh or "", at, (0.0, 0.0, 0.0, 1.0), _single(spec.rgba)),)
+
+
+def _dress(visual: Visual, values: Mapping[str, Any], *sections: str) -> Visual:
+    """Return a visual shape with the colour and the texture that are drawn; those of the last section win."""
+    for section in sections:
+        if (color := values.get(f"{section}.color")) is not None:
+            visual = visual._replace(rgba=_single((*color, visual.rgba[3])))
+        if (texture := values.get(f"{section}.texture")) is not None:
+            visual = visual._replace(texture=texture)
+    return visual
+
+
+def _make_look(values: Mapping[str, Any], shadows: bool) -> Look:
+    """Return light and background, which are the default ones where nothing was drawn."""
+    count = values.get(COUNT, 1)
+    share = values.get("light.intensity", 1.0) / count
+    lights = tuple(_make_light(values, k, share) for k in range(count))
+    exposure = {
+        key.split(".")[1]: value
+        for key, value in values.items()
+        if key.startswith("cameras.") and key.endswith(".exposure")
+    }
+    background = tuple(values.get("background.color", BACKGROUND))
+    ambient = values.get("light.ambient", 1.0)
+    return Look(lights, ambient, background, values.get("background.texture", ""), shadows, exposure)
+
+
+def _make_light(values: Mapping[str, Any], number: int, intensity: float) -> Light:
+    x, y, z = Light().direction
+    azimuth, elevation = math.atan2(y, x), math.atan2(z, math.hypot(x, y))
+    if (given := values.get(f"light.{number}.azimuth_deg")) is not None:
+        azimuth = math.radians(given)
+    if (given := values.get(f"light.{number}.elevation_deg")) is not None:
+        elevation = math.radians(given)
+    flat = math.cos(elevation)
+    red, green, blue = values.get(f"light.{number}.color", (1.0, 1.0, 1.0))
+    direction = flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)
+    return Light(direction, (intensity * red, intensity * green, intensity * blue))
 
 
 def _single(rgba: Sequence[float]) -> tuple[float, ...]:

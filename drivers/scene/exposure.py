@@ -23,6 +23,7 @@ import math
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -35,8 +36,10 @@ from hal.config.schema import Flag, Strict, describe
 from hal.driver import RawFrame
 from hal.errors import ConfigError, DeviceNotFound, Problem
 from hal.geometry import Pose
+from hal.randomization import vary_camera
 from hal.specs import CameraSpec, SensorSpec
 
+from .disturbances import UNCHANGED, Randomized
 from .renderer import RenderedImages, Renderer
 
 __all__ = [
@@ -44,6 +47,7 @@ __all__ = [
     "DepthNoiseOptions",
     "Exposure",
     "LidarNoiseOptions",
+    "PictureNoise",
     "PosedWorld",
     "StereoNoiseOptions",
     "camera_pose",
@@ -63,6 +67,10 @@ _SIDES = ("infrared", "infrared_right")
 class PosedWorld(Protocol):
     """A world, as far as the place of a camera in it is concerned."""
 
+    @property
+    def randomized(self) -> Randomized:
+        """What the world was randomized with."""
+
     def pose(self, name: str, link: str | None = None) -> Mapping[str, Any]:
         """Return ``position`` (3,) m and ``orientation`` (4,) xyzw of a link; raises DeviceNotFound."""
 
@@ -79,14 +87,27 @@ class Exposure:
     """Makes the frames of one camera.
 
     Colour, depth and segmentation share one view, which is that of colour or depth. Each infrared picture has a view of
-    its own, and costs another drawing, unless the views are the same.
+    its own, and costs another drawing, unless the views are the same. A randomization of the world changes them; its
+    noise is that of its seed and of the number of frames since.
 
     Raises:
         ConfigError: The noise options are wrong.
     """
 
     def __init__(self, spec: CameraSpec) -> None:
-        self.spec = spec
+        self._nominal = spec
+        self._frames_before = 0
+        self._prepare(UNCHANGED)
+
+    def _prepare(self, drawn: Randomized) -> None:
+        """Build the views, and the noise, of a randomization."""
+        spec = vary_camera(self._nominal, drawn.values)
+        section = f"cameras.{spec.name}"
+        self.randomized, self.spec = drawn, spec
+        self.latency = drawn.get(section, "latency_s")
+        """Time from the exposure to the program, s."""
+        self._blur = PictureNoise(drawn.get(section, "color_noise"), drawn.get(section, "depth_noise"))
+        self._key = drawn.seed, zlib.crc32(spec.name.encode())
         self._T_color = frame_from_color(spec)
         self._noise = depth_noise(spec)
         self._sides = {name: _side(spec, name) for name in _SIDES if name in spec.streams}
@@ -106,6 +127,9 @@ class Exposure:
             t_device: Stamp of the frame, s on the clock of the world.
             number: Number of the frame, which also selects its noise.
         """
+        if world.randomized is not self.randomized:
+            self._prepare(world.randomized)
+            self._frames_before = number - 1 if world.randomized.values else 0
         here = camera_pose(world, self.spec)
         view = _moved(here, self._T_color)
         images = RenderedImages(None, None, None, None)
@@ -114,17 +138,80 @@ class Exposure:
         sides = {
             name: renderer.render(shot.spec, _moved(here, shot.T_color)).infrared for name, shot in self._sides.items()
         }
-        depth = images.depth
+        depth, count = images.depth, number - self._frames_before
         if self._noise is not None and depth is not None:
-            depth = self._noise(depth, number)
+            depth = self._noise(depth, count)
+        random = np.random.Generator(np.random.SFC64([*self._key, count])) if self._blur.active else None
+        pictures = {**images._asdict(), **sides}
+        light = {name: self._blur.blur_light(pictures.get(name), random) for name in ("color", *_SIDES)}
         return RawFrame(
             t,
             t_device,
             number,
             T_world_camera=view,
             skew=0.0 if images.color is not None and depth is not None else None,
-            **{**images._asdict(), "depth": depth, **sides},
+            **{**pictures, **light, "depth": self._blur.blur_depth(depth, random)},
         )
+
+
+class PictureNoise:
+    """Normal noise of pictures; of depth it grows with the square of the distance, as that of stereo cameras does.
+
+    Drawing a number for each pixel would take longer than drawing the picture: the noise is a part of one long
+    sequence, which begins elsewhere for each picture.
+
+    Args:
+        light: Standard deviation of colour and infrared, as a share of white.
+        depth: That of depth at 1 m, m.
+    """
+
+    def __init__(self, light: float, depth: float) -> None:
+        self._light, self._depth = light, depth
+        self._lighter: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
+        """What pictures of a size get added, and taken away."""
+        self._farther: dict[int, Image] = {}
+        """Noise of depth pictures of a size at 1 m, m."""
+        self.active = light > 0.0 or depth > 0.0
+        """Whether there is any."""
+
+    def blur_light(
+        self, picture: NDArray[np.uint8] | None, random: np.random.Generator | None
+    ) -> NDArray[np.uint8] | None:
+        """Return a picture of any shape with noise; ``random`` chooses it."""
+        if picture is None or random is None or not self._light:
+            return picture
+        size, start = picture.size, int(random.integers(_STARTS))
+        if size not in self._lighter:
+            scaled = np.clip(np.rint(255.0 * self._light * _normal_numbers(size)), -255, 255).astype(np.int16)
+            self._lighter[size] = np.maximum(scaled, 0).astype(np.uint8), np.maximum(-scaled, 0).astype(np.uint8)
+        more, less = (part[start : start + size].reshape(picture.shape) for part in self._lighter[size])
+        noisy = np.minimum(picture, 255 - more)  # nothing overflows, without a wider type, which would take longer
+        noisy += more
+        np.maximum(noisy, less, out=noisy)
+        noisy -= less
+        return noisy
+
+    def blur_depth(self, depth: Image | None, random: np.random.Generator | None) -> Image | None:
+        """Return depth (H, W), m, with noise where there is depth."""
+        if depth is None or random is None or not self._depth:
+            return depth
+        size, start = depth.size, int(random.integers(_STARTS))
+        if size not in self._farther:
+            self._farther[size] = np.float32(self._depth) * _normal_numbers(size)
+        noisy: Image = depth * depth
+        noisy *= self._farther[size][start : start + size].reshape(depth.shape)
+        noisy += depth
+        return np.maximum(noisy, 0.0, out=noisy)
+
+
+_STARTS = 1 << 16
+"""Number of places where noise may begin."""
+
+
+@lru_cache(maxsize=8)
+def _normal_numbers(size: int) -> Image:
+    """Return more than ``size`` numbers with a standard deviation of 1."""
+    return np.random.default_rng(size).standard_normal(size + _STARTS, np.float32)
 
 
 def _moved(pose: Pose, by: Pose) -> Pose:

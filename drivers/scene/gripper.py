@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConfigError, ConnectionLost, Problem
 from hal.specs import GripperSpec, RobotSpec
 
+from .disturbances import Disturbances
 from .engine import SimulatedBody
 from .world import SimulatedWorld
 
@@ -101,6 +103,9 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     Each finger is driven by a position motor whose force is the grip force: on an object the motors press with that
     force, from both sides, until the next command. All fingers are one drive: none can be moved, or stopped, alone.
+
+    With the latencies and the noise of ``rig.world.randomize`` the fingers begin a motion later, and what is reported
+    was measured some time before, at its ``t_device``.
     """
 
     simulated: ClassVar[bool] = True
@@ -133,6 +138,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._placed = (0, 0.0, 0.0)
         """The step at which a reset or a restored state placed the fingers, and the force and the load (N) that are
         measured until the next one: the engine may still have those of before."""
+        section = f"robots.{spec.arm}.gripper"
+        self._disturbances = Disturbances(world, section, ("width_noise", "force", "moving", "grasped"))
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -174,13 +181,29 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         if not self._open:
             self.scene.on_reset(self.body.name, self._was_reset)
             self.scene.keep(f"{self.body.name}.gripper", self._save, self._restore)
-            if self.travel.varies:
-                self.scene.before_steps(f"{self.body.name}.gripper", self._drive_on)
+            self.scene.before_steps(f"{self.body.name}.gripper", self._before_step)
         self._open = True
 
     def read(self, now: float) -> GripperReading:
         """Return the fingers after the last physics step; ``force`` is that of the weaker motor, N."""
         self._expect_open()
+        self._disturbances.update()
+        sensed = self._sense()
+        t, (width, force, moving, grasped) = self._disturbances.measure(*sensed)
+        moving = moving or sensed[2]  # what a command has begun is known at once
+        return GripperReading(
+            t=now,
+            t_device=t,
+            seq=self.scene.steps,
+            width=width,
+            width_target=self._target,
+            moving=moving,
+            grasped=grasped and not moving,
+            force=force,
+        )
+
+    def _sense(self) -> tuple[float, float, bool, bool]:
+        """Return the present width, m, the force, N, whether the fingers move, and whether they hold something."""
         width, speed, force, load = self._measure()
         if not math.isfinite(width + speed + force + load):  # the simulation is unstable, which its arms report
             width, speed, force, load = self._stood, 0.0, 0.0, 0.0
@@ -188,16 +211,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         pressing = force >= PRESSING * self._force
         idle = not moving and abs(width - self._target) <= AT_TARGET and load < PRESSING * self._force
         self._engage(not idle)
-        return GripperReading(
-            t=now,
-            t_device=self.scene.t,
-            seq=self.scene.steps,
-            width=width,
-            width_target=self._target,
-            moving=moving,
-            grasped=not moving and pressing and width > self._target + AT_TARGET,
-            force=force,
-        )
+        return width, force, moving, not moving and pressing and width > self._target + AT_TARGET
 
     def _measure(self) -> tuple[float, float, float, float]:
         """Return what :meth:`read_width` returns, with the forces of the present state."""
@@ -217,8 +231,11 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._engaged = active
         self.handle_fingers(active)
 
-    def _drive_on(self) -> None:
-        if self._engaged and self._driven is not None:
+    def _before_step(self) -> None:
+        self._disturbances.update()
+        if self._disturbances.active:
+            self._disturbances.measure(*self._sense())
+        if self.travel.varies and self._engaged and self._driven is not None:
             self.drive_fingers(self._driven)
 
     def _expect_open(self) -> None:
@@ -232,8 +249,16 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._resting, self._stood_since = False, self.scene.steps
         self._settle = max(SETTLE, 2.0 * STILL / self._speed)
         self._engage(True)
-        self._driven = self._speed
-        self.drive_fingers(self._driven)
+        self._send(self._speed)
+
+    def _send(self, speed: float) -> None:
+        """Let the fingers go to the target, with a speed of the width, m/s, when the command arrives."""
+        self._settle += self._disturbances.commands.steps * self.scene.dt
+        self._disturbances.send(partial(self._carry_out, speed))
+
+    def _carry_out(self, speed: float) -> None:
+        self._driven = speed
+        self.drive_fingers(speed)
 
     def _at_rest(self, width: float, speed: float) -> bool:
         """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""
@@ -258,8 +283,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             return
         self._target = width
         self._engage(True)
-        self._driven = self.spec.speed
-        self.drive_fingers(self._driven)
+        self._send(self.spec.speed)
 
     def close(self) -> None:
         """Disconnect; the motors hold, or press, for as long as the world exists."""
@@ -280,9 +304,11 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         now = self.scene.steps
         self._stood_since, self._seen = now - state["stood_for"], now - state["unseen_for"]
         self._placed = (now, state["pressed"] or 0.0, state["load"] or 0.0)
+        self._disturbances.forget()
         self.resume_motors()
 
     def _was_reset(self) -> None:
+        self._disturbances.forget()
         self._driven = None
         self._target = self._stood = self.read_width()[0]
         self._resting, self._stood_since = True, self.scene.steps

@@ -35,7 +35,7 @@ _COARSE_SAVES = 0.7
 """Share of the triangles above which a coarse mesh is not worth its memory."""
 _CREASE = float(np.cos(np.radians(35)))
 """An edge is sharp where its faces turn by more than this."""
-_FIELDS = tuple(field.name for field in fields(Mesh) if field.name != "coarse")
+_FIELDS = tuple(field.name for field in fields(Mesh) if field.name not in ("coarse", "repeated"))
 _CLOSED_SHARE = 0.9
 """Share of edges with a face on either side above which a mesh counts as the surface of a solid."""
 _HEAVY = 3000

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from collections import deque
 from collections.abc import Sequence
 from typing import Any, Protocol
 
 from hal.host.memory import SeriesBox
-from hal.world import WorldDriver
 
 from .drawn import DrawnWorld
+from .world import SimulatedWorld
 
 __all__ = ["LocalMirror", "MirrorWorld", "WorldMirror"]
 
@@ -77,19 +79,38 @@ class LocalMirror:
         world: The world, before its first edit.
     """
 
-    def __init__(self, world: WorldDriver) -> None:
+    def __init__(self, world: SimulatedWorld[Any]) -> None:
         self.world = world
         self.drawn = DrawnWorld(world.spec)
-        self._version: tuple[int, int] | None = None
+        self._shown: tuple[tuple[int, int], int] | None = None
+        """Version of the world, and the step of it that is shown."""
+        self._past: deque[tuple[int, list[float]]] = deque(maxlen=0)
+        """Step and snapshot of past states; empty if no camera has a latency."""
         world.on_edit(self._repeat)
 
     def _repeat(self, method: str, params: dict[str, Any], revision: int) -> None:
         self.drawn.request(method, params)
+        if method == "randomize":
+            latest = [value for key, value in params["values"].items() if _LATENCY.fullmatch(key)]
+            steps = round(max(latest, default=0.0) / self.world.dt)
+            self._past = deque(maxlen=steps + 1 if steps else 0)
+            self.world.before_steps("pictures", self._note_state if steps else None)
 
-    def update(self) -> tuple[int, int]:
-        """Show the present state of the world; return its version."""
-        version = self.world.version
-        if version != self._version:
-            self.drawn.show(self.world.snapshot())
-            self._version = version
-        return version
+    def _note_state(self) -> None:
+        self._past.append((self.world.steps, self.world.snapshot()))
+
+    def update(self, latency: float = 0.0) -> float:
+        """Show the state that the world had ``latency`` s ago, but none before a reset; return its time, s."""
+        world = self.world
+        wanted = max(world.steps - round(latency / world.dt), world.began_at)
+        snapshot: list[float] | None = None
+        if wanted < world.steps:  # else the present, which may have been edited since the step
+            kept = ((step, state) for step, state in self._past if step >= wanted)
+            wanted, snapshot = next(kept, (world.steps, None))
+        if self._shown != (world.version, wanted):
+            self.drawn.show(world.snapshot() if snapshot is None else snapshot)
+            self._shown = world.version, wanted
+        return wanted * world.dt
+
+
+_LATENCY = re.compile(r"cameras\.[^.]+\.latency_s")

@@ -20,24 +20,20 @@ from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
+from .lighting import BACKGROUND, Backdrop, Light, Look, ShadowMap
 from .meshes import MeshLibrary
 from .shapes import DrawnPart, RenderScene, Visual, parts_of
+from .textures import load_texture
 
 __all__ = ["BACKGROUND", "LUMINANCE", "GLRenderer", "RenderedImages", "Renderer", "create_context"]
 
 Array = NDArray[np.float64]
 
-BACKGROUND = (0.72, 0.76, 0.80)
-"""Colour of the background."""
 LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue (ITU-R BT.601)."""
 _NEAR, _FAR = 0.01, 100.0
 """Range of what is drawn, m. A camera's own range only blanks its depth."""
 _REMEDY = "apt install libegl1 libgl1-mesa-dri"
-_KEY_LIGHT = np.array([-0.35, 0.45, 0.82])
-"""Direction towards the light, in the world."""
-
-
 _COARSE_PIXELS = 6.0
 """A link is drawn coarsely where the omitted details are smaller than so many pixels: a whole arm in a picture of
 256 x 256 from 1 m on, in one of 640 x 480 from 2.5 m on."""
@@ -83,8 +79,10 @@ class _Drawable(NamedTuple):
     indices: Any
     layout: tuple[str, ...]
     texture: Any
-    arrays: dict[tuple[str, ...], Any]
-    """Its vertex array for each set of streams."""
+    arrays: dict[tuple[str, ...] | str, Any]
+    """Its vertex array for each program."""
+    buffers: list[Any]
+    """Further buffers that its arrays use."""
 
 
 class _Body(NamedTuple):
@@ -128,6 +126,8 @@ class GLRenderer(Renderer):
         self._textures: dict[int, tuple[Any, Any]] = {}
         self._targets: dict[tuple[int, int, tuple[str, ...]], _Target] = {}
         self._programs: dict[tuple[str, ...], Any] = {}
+        self._shadows: ShadowMap | None = None
+        self._backdrop: Backdrop | None = None
 
     def render(self, camera: CameraSpec, T_world_camera: Pose) -> RenderedImages:
         with self._lock, self._context:
@@ -176,41 +176,42 @@ class GLRenderer(Renderer):
         if mesh.texture is not None and mesh.uv is not None:
             columns.append(mesh.uv)
             layout = ("3f4 3f4 4f1 2f4", "position", "normal", "color", "uv")
-            texture = self._texture(mesh.texture)
+            texture = self._texture(mesh.texture, repeated=mesh.repeated)
         rows = np.concatenate([np.ascontiguousarray(c).view(np.uint8).reshape(len(c), -1) for c in columns], axis=1)
         vertices = self._context.buffer(rows.tobytes())
         indices = self._context.buffer(np.ascontiguousarray(mesh.faces, np.uint32).tobytes())
-        return _Drawable(part, vertices, indices, layout, texture, {})
+        return _Drawable(part, vertices, indices, layout, texture, {}, [])
 
-    def _texture(self, image: NDArray[np.uint8]) -> Any:
+    def _texture(self, image: NDArray[np.uint8], repeated: bool) -> Any:
         if id(image) not in self._textures:
             height, width = image.shape[:2]
             texture = self._context.texture((width, height), 3, image[::-1].tobytes(), alignment=1)
             texture.build_mipmaps()
+            if repeated:  # these cover most of a picture: sharper edges are nearly free, smooth ones take a fifth more
+                texture.filter = self._context.NEAREST_MIPMAP_NEAREST, self._context.NEAREST
             self._textures[id(image)] = (texture, image)  # the image is kept, so that its id stays its own
         return self._textures[id(image)][0]
 
     def _draw(self, camera: CameraSpec, T_world_camera: Pose) -> RenderedImages:
+        look = self._scene.look
         streams = tuple(name for name in _OUTPUTS if name in camera.streams)
         target = self._target(camera.width, camera.height, streams)
-        T_camera_world = np.linalg.inv(T_world_camera.matrix())
-        frames = self._scene.link_frames(self._links)
+        T_camera_world: Any = np.linalg.inv(T_world_camera.matrix())
+        frames: Array = self._scene.link_frames(self._links)
         model_view = (T_camera_world @ frames)[self._link_of]
         to_clip = _projection(camera)
         # Large distances are multiplied here in double precision, not in the shader.
         transforms = np.stack([to_clip @ model_view, model_view], axis=1)
         packed = np.ascontiguousarray(transforms.transpose(0, 1, 3, 2), np.float32).reshape(-1, 32)
 
-        target.clear()
-        for key, value in (
-            ("key_light", T_camera_world[:3, :3] @ (_KEY_LIGHT / np.linalg.norm(_KEY_LIGHT))),
-            ("up", T_camera_world[:3, 2]),
-            ("range", (camera.depth_min, camera.depth_max)),
-        ):
-            self._set(streams, key, value)
+        exposure = look.exposure.get(camera.name, 1.0)
+        variant = self._light(look, streams, camera, frames, T_camera_world, exposure)
+        target.clear(np.clip(exposure * np.array(look.background), 0.0, 1.0))
+        target.use()
         for number in self._visible(camera, model_view):
             drawable = self._drawables[number]
-            program = self._program(streams, drawable.texture is not None)
+            key = (*variant, "textured") if drawable.texture is not None else variant
+            program = self._program(streams, key)
             matrices = packed[number]
             program["model_view_projection"].write(matrices[:16])
             if "model_view" in program:
@@ -222,14 +223,72 @@ class GLRenderer(Renderer):
             self._context.enable_only(
                 self._context.DEPTH_TEST | (self._context.CULL_FACE if drawable.part.mesh.closed else 0)
             )
-            self._array(drawable, streams, program).render()
+            self._array(drawable, (*streams, *key), program).render()
+        if look.backdrop:
+            self._draw_backdrop(look, target, to_clip[:2, :3], T_world_camera, exposure)
         return target.read()
 
-    def _set(self, streams: tuple[str, ...], key: str, value: Any) -> None:
-        for textured in (False, True):
-            program = self._program(streams, textured)
-            if key in program:
-                program[key].value = tuple(float(v) for v in value)
+    def _light(
+        self,
+        look: Look,
+        streams: tuple[str, ...],
+        camera: CameraSpec,
+        frames: Array,
+        T_camera_world: Array,
+        gain: float,
+    ) -> tuple[str, ...]:
+        """Draw the shadow map and set everything that does not differ between parts; return the kind of programs."""
+        key, *fills = look.lights or (Light(color=(0.0, 0.0, 0.0)),)
+        lit = bool({"color", "infrared"} & set(streams))
+        values: dict[str, Any] = {
+            "key_light": T_camera_world[:3, :3] @ _unit(key.direction),
+            "key_color": key.color,
+            "up": T_camera_world[:3, 2],
+            "range": (camera.depth_min, camera.depth_max),
+            "ambience": look.ambient,
+            "exposure": gain,
+        }
+        variant: tuple[str, ...] = ()
+        if fills:
+            variant = ("fill",)
+            # Half from everywhere, half by the side that a surface has towards the light; and the ambient light, too.
+            colors = 0.5 * _KEY * np.array([light.color for light in fills])
+            directions = np.array([T_camera_world[:3, :3] @ _unit(light.direction) for light in fills])
+            low, high = 0.5 * look.ambient * np.array(_AMBIENT)
+            by_side = colors.T @ directions + np.outer(high - low, T_camera_world[:3, 2])
+            values |= {"fill": colors.sum(axis=0) + low + high, "fill_by_side": by_side.T.ravel()}
+        if look.shadows and lit:
+            variant += ("shadows",)
+            to_light = self._draw_shadows(_unit(key.direction), frames) @ np.linalg.inv(T_camera_world)
+            assert self._shadows is not None
+            self._shadows.use(1)
+            values |= {"shadow_map": 1, "to_light": to_light[:3].T.ravel(), "offset": self._shadows.offset}
+        for kind in (variant, (*variant, "textured")):
+            program = self._program(streams, kind)
+            for name, value in values.items():
+                if name in program:
+                    program[name].value = value if np.isscalar(value) else tuple(map(float, value))
+        return variant
+
+    def _draw_shadows(self, direction: Array, frames: Array) -> Array:
+        """Return the matrix (4, 4) from the world to the shadow map, which shows the present state of the world."""
+        if self._shadows is None:
+            self._shadows = ShadowMap(self._context)
+        # Of a link that has coarse parts, these cast the shadow.
+        cast = self._coarse | np.isinf(self._cells)[self._link_of]
+        numbers = np.flatnonzero(cast)
+        key = (self._revision, direction.tobytes(), frames.tobytes())
+        casters = [self._drawables[number] for number in numbers]
+        return self._shadows.draw(key, direction, casters, frames[self._link_of[numbers]], self._balls[numbers])
+
+    def _draw_backdrop(self, look: Look, target: _Target, lens: Array, pose: Pose, gain: float) -> None:
+        if self._backdrop is None:
+            self._backdrop = Backdrop(self._context)
+        inverse = np.linalg.inv(np.vstack([lens, [0.0, 0.0, 1.0]]))
+        rays = pose.matrix()[:3, :3] @ inverse
+        texture = self._texture(load_texture(look.backdrop), repeated=True)
+        for name, layer in target.layers():
+            self._backdrop.draw(layer, texture, rays, gain * np.array(look.background), name == "infrared")
 
     def _visible(self, camera: CameraSpec, model_view: Array) -> Iterator[int]:
         """Yield the drawables that the picture may show, nearest first, so that hidden pixels are not shaded."""
@@ -255,8 +314,8 @@ class GLRenderer(Renderer):
             self._targets[key] = _Target(self._context, width, height, streams)
         return self._targets[key]
 
-    def _program(self, streams: tuple[str, ...], textured: bool) -> Any:
-        key = (*streams, "textured") if textured else streams
+    def _program(self, streams: tuple[str, ...], kind: tuple[str, ...]) -> Any:
+        key = (*streams, *kind)
         if key not in self._programs:
             defines = "".join(f"#define {name.upper()}\n" for name in key)
             outputs = "".join(
@@ -269,21 +328,27 @@ class GLRenderer(Renderer):
             )
         return self._programs[key]
 
-    def _array(self, drawable: _Drawable, streams: tuple[str, ...], program: Any) -> Any:
-        if streams not in drawable.arrays:
+    def _array(self, drawable: _Drawable, key: tuple[str, ...], program: Any) -> Any:
+        if key not in drawable.arrays:
             content = [(drawable.vertices, *drawable.layout)]
-            drawable.arrays[streams] = self._context.vertex_array(
+            drawable.arrays[key] = self._context.vertex_array(
                 program, content, index_buffer=drawable.indices, skip_errors=True
             )
-        return drawable.arrays[streams]
+        return drawable.arrays[key]
+
+
+def _unit(direction: Any) -> Array:
+    vector = np.asarray(direction, float)
+    result: Array = vector / np.linalg.norm(vector)
+    return result
 
 
 def _release(body: _Body | None) -> None:
     for drawable in body.drawables if body else ():
         for array in drawable.arrays.values():
             array.release()
-        drawable.vertices.release()
-        drawable.indices.release()
+        for buffer in (drawable.vertices, drawable.indices, *drawable.buffers):
+            buffer.release()
 
 
 # --- where OpenGL draws to --------------------------------------------------------------------------------------------
@@ -330,11 +395,26 @@ class _Target:
         self._depth = context.framebuffer([], depth)
         self._all = context.framebuffer(layers, depth)
         self._each = [context.framebuffer([layer]) for layer in layers]
+        self._lit = {
+            name: context.framebuffer([layer], depth)
+            for name, layer in zip(streams, layers, strict=True)
+            if name in ("color", "infrared")
+        }
 
-    def clear(self) -> None:
+    def clear(self, background: Array) -> None:
+        """Clear all layers; ``background`` (3,) is the colour of the background, 0..1."""
+        grey = float(background @ np.array(LUMINANCE))
+        colors = {"color": (*background.tolist(), 1.0), "infrared": (grey,) * 4}
         for name, layer in zip(self._streams, self._each, strict=True):
-            layer.clear(*_OUTPUTS[name].background)
+            layer.clear(*colors.get(name, _OUTPUTS[name].background))
         self._depth.clear(depth=1.0)
+
+    def layers(self) -> Iterator[tuple[str, Any]]:
+        """Yield the framebuffer of each layer that shows light, with the depths of what was drawn."""
+        yield from self._lit.items()
+
+    def use(self) -> None:
+        """Draw into all layers."""
         self._all.use()
 
     def read(self) -> RenderedImages:
@@ -387,16 +467,19 @@ class _Output(NamedTuple):
     background: tuple[float, float, float, float]
 
 
-_GREY = sum(weight * value for weight, value in zip(LUMINANCE, BACKGROUND, strict=True))
-
 _OUTPUTS = {
-    "color": _Output("vec4", 4, "f1", np.uint8, (*BACKGROUND, 1.0)),
+    "color": _Output("vec4", 4, "f1", np.uint8, (0.0, 0.0, 0.0, 1.0)),
     "depth": _Output("float", 1, "f4", np.float32, (0.0, 0.0, 0.0, 0.0)),
-    "infrared": _Output("float", 1, "f1", np.uint8, (_GREY, _GREY, _GREY, _GREY)),
+    "infrared": _Output("float", 1, "f1", np.uint8, (0.0, 0.0, 0.0, 0.0)),
     # A float holds every whole number below 2^24; an integer layer cannot be cleared to -1 through moderngl.
     "segmentation": _Output("float", 1, "f4", np.float32, (-1.0, -1.0, -1.0, -1.0)),
 }
-"""How each stream is drawn; their order is that of the layers."""
+"""How each stream is drawn; their order is that of the layers. The background of light is that of the scene's look."""
+
+_KEY = 0.36
+"""Share of the light that comes from the first light."""
+_AMBIENT = (0.34, 0.32, 0.31), (0.52, 0.54, 0.57)
+"""Light from everywhere on what faces downwards, and upwards."""
 
 _VERTEX = """
 #if defined(COLOR) || defined(INFRARED)
@@ -415,6 +498,11 @@ out vec3 paint;
 in vec2 uv;
 out vec2 place;
 #endif
+#ifdef SHADOWS
+uniform mat4x3 to_light;
+uniform float offset;
+out vec3 in_light;
+#endif
 #endif
 void main() {
     gl_Position = model_view_projection * vec4(position, 1.0);
@@ -425,17 +513,37 @@ void main() {
 #ifdef TEXTURED
     place = uv;
 #endif
+#ifdef SHADOWS
+    in_light = to_light * vec4(offset * facing - to_eye, 1.0);
+#endif
 #endif
 }
 """
 
-_FRAGMENT = """
+_FRAGMENT = (
+    f"""
+#define KEY {_KEY}
+#define LOW vec3{_AMBIENT[0]}
+#define HIGH vec3{_AMBIENT[1]}
+"""
+    + """
 #if defined(COLOR) || defined(INFRARED)
 #define LIT
 #endif
 #ifdef LIT
 uniform vec3 key_light;
+uniform vec3 key_color;
 uniform vec3 up;
+uniform float ambience;
+uniform float exposure;
+#ifdef FILL
+uniform vec3 fill;
+uniform mat3 fill_by_side;
+#endif
+#ifdef SHADOWS
+uniform sampler2DShadow shadow_map;
+in vec3 in_light;
+#endif
 in vec3 to_eye;
 in vec3 facing;
 in vec3 paint;
@@ -458,11 +566,21 @@ void main() {
 #ifdef TEXTURED
     base *= texture(picture, place).rgb;
 #endif
-    vec3 ambient = mix(vec3(0.34, 0.32, 0.31), vec3(0.52, 0.54, 0.57), 0.5 + 0.5 * dot(n, up));
-    float key = 0.36 * max(dot(n, key_light), 0.0);
+    float side = max(dot(n, key_light), 0.0);
     float head = 0.12 * max(dot(n, eye), 0.0);
     float gloss = 0.05 * pow(max(dot(n, normalize(key_light + eye)), 0.0), 24.0);
-    vec3 seen = base * (ambient + key + head) + gloss;
+    float lit = 1.0;
+#ifdef SHADOWS
+    if (side > 0.0 && all(lessThan(abs(in_light - 0.5), vec3(0.5))))
+        lit = texture(shadow_map, in_light);
+#endif
+#ifdef FILL
+    vec3 around = fill + fill_by_side * n + ambience * head;
+#else
+    vec3 around = ambience * (mix(LOW, HIGH, 0.5 + 0.5 * dot(n, up)) + head);
+#endif
+    vec3 light = around + lit * KEY * side * key_color;
+    vec3 seen = exposure * (base * light + lit * gloss * key_color);
 #endif
 #ifdef COLOR
     out_color = vec4(seen, 1.0);
@@ -479,3 +597,4 @@ void main() {
 #endif
 }
 """
+)

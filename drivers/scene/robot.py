@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 from hal.driver import Reading, RobotDriver, Setpoint
@@ -11,6 +12,7 @@ from hal.errors import CommandError, ConnectionLost, Fault
 from hal.following import Following
 from hal.specs import RobotSpec
 
+from .disturbances import Disturbances
 from .world import SimulatedWorld
 
 __all__ = ["SimulatedRobot"]
@@ -36,6 +38,9 @@ class SimulatedRobot(RobotDriver, Generic[W]):
 
     A set-point with torques switches the motors off, and adds its torques to the compensation of gravity; one without
     switches them on again. The last torques are held for 20 ms without new ones, then the motors hold the arm.
+
+    With the latencies and the noise of ``rig.world.randomize``, motors get a set-point later and not exactly, and a
+    reading has what was measured some time before, at its ``t_device``. ``q_commanded`` is what the arm has accepted.
     """
 
     modes: ClassVar[frozenset[str]] = frozenset({"position", "velocity", "torque"})
@@ -64,6 +69,10 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         """Torques that drive the arm, Nm; None while the motors follow positions."""
         self._received = 0
         """The step before which the last torques arrived."""
+        noise = "position_noise", "velocity_noise", "torque_noise"
+        self._disturbances = Disturbances(world, f"robots.{spec.name}", noise)
+        self._arrived: tuple[Floats, Floats] | None = None
+        """What the motors follow while newer set-points are under way; None if it is the newest."""
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -106,18 +115,20 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         if not self._open or not self._connected:
             raise self._lost()
         world = self.scene
+        self._disturbances.update()
         if self._tau is not None:
             self._keep_torques(self._tau)
         if self._freeze and self._frozen is not None:
             return self._frozen
         q, dq, tau = self.read_state()
         if self._tau is None and self._q is not None and self._dq is not None and world.fault is None:
-            away = self._following.check(world.t, q, self._q, self._dq)
+            away = self._following.check(world.t, q, *(self._arrived or (self._q, self._dq)))
             if away is not None:
                 self._away = self._away or away
                 self._hold(q)
         fault = self._fault or self._away or world.fault
-        reading = Reading(now, world.t, world.steps, q, dq, tau, self._q, self._dq, None, None, fault)
+        t, (q, dq, tau) = self._disturbances.measure(q, dq, tau)
+        reading = Reading(now, t, world.steps, q, dq, tau, self._q, self._dq, None, None, fault)
         self._frozen = reading
         return reading
 
@@ -127,6 +138,14 @@ class SimulatedRobot(RobotDriver, Generic[W]):
             raise self._lost()
         if self._fault is not None or self._away is not None:
             return
+        if self._disturbances.active:
+            self._disturbances.send(partial(self._carry_out, setpoint))
+        else:
+            self._carry_out(setpoint)
+        self._q, self._dq = setpoint.q, setpoint.dq
+
+    def _carry_out(self, setpoint: Setpoint) -> None:
+        """Let the motors do what a set-point says that has arrived."""
         q, dq, tau = setpoint.q, setpoint.dq, setpoint.tau
         if tau is not None:
             if self._tau is None:
@@ -135,9 +154,10 @@ class SimulatedRobot(RobotDriver, Generic[W]):
             self._keep_torques(tau)
         else:
             if self._tau is not None:
-                self._hold(q)  # puts the motors' speed limits back
-            self.follow_setpoint(q, dq)
-        self._q, self._dq = q, dq
+                self.hold_at(q)  # puts the motors' speed limits back
+                self._tau = None
+            self.follow_setpoint(self._disturbances.blur_command(q), dq)
+        self._arrived = q, dq
 
     def _keep_torques(self, tau: Floats) -> None:
         """Apply torques to each step and compensate gravity, as an arm's own controller does between commands."""
@@ -148,7 +168,12 @@ class SimulatedRobot(RobotDriver, Generic[W]):
 
     def halt(self) -> None:
         """Hold the last set-point; an arm that is driven by torques holds its present position."""
-        if self._open and self._q is not None:
+        if not self._open or self._q is None:
+            return
+        if self._tau is None and self._disturbances.active:  # after the set-points that are under way
+            self._dq = [0.0] * len(self._q)
+            self._disturbances.send(partial(self._carry_out, Setpoint(self._q, self._dq, self._dq)))
+        else:
             self._hold(self._q if self._tau is None else self._positions())
 
     def recover(self) -> None:
@@ -198,7 +223,8 @@ class SimulatedRobot(RobotDriver, Generic[W]):
     def _hold(self, q: Floats) -> None:
         self.hold_at(q)
         self._q, self._dq = list(q), [0.0] * len(q)
-        self._tau = None
+        self._tau = self._arrived = None
+        self._disturbances.commands.clear()
 
     def _positions(self) -> Floats:
         return self.read_state()[0]
@@ -209,14 +235,16 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         return state | {"age": self.scene.steps - self._received}
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self._frozen = None
+        self._frozen = self._arrived = None
+        self._disturbances.forget()
         self._q, self._dq, self._tau = state["q"], state["dq"], state["tau"]
         self._received = self.scene.steps - state["age"]
         self._away = None
         self._following.forget()
 
     def _was_reset(self) -> None:
-        self._frozen = None
+        self._frozen = self._arrived = None
+        self._disturbances.forget()
         self._q, self._dq = self._positions(), [0.0] * len(self.spec.joints)
         self._tau = self._away = None
         self._following.forget()

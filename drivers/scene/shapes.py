@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 from hal.geometry import Pose
 
+from .lighting import Look
+from .textures import load_texture
+
 __all__ = [
     "DrawnPart",
     "Mesh",
@@ -35,6 +38,8 @@ Points = NDArray[np.float32]
 _SEGMENTS, _COARSE_SEGMENTS = 48, 16
 """Segments of a circle, and of that of a sphere or capsule that is small in the picture. A chord leaves the circle by
 0.2 % of its radius, or by 1.9 %."""
+_TEXTURE = 0.25
+"""Side of a texture that covers a body, m."""
 _PLANE_HALF = 50.0
 """Half the side of the square that is drawn for an infinite plane, m."""
 
@@ -67,6 +72,8 @@ class Visual(NamedTuple):
     orientation: tuple[float, ...]
     """(4,) xyzw."""
     rgba: tuple[float, ...]
+    texture: str = ""
+    """Picture that covers it instead of its own, see :mod:`.textures`; empty for none."""
 
 
 class RenderScene(Protocol):
@@ -77,6 +84,10 @@ class RenderScene(Protocol):
     @property
     def revision(self) -> int:
         """Changes whenever bodies or their visual shapes do."""
+
+    @property
+    def look(self) -> Look:
+        """Light, shadows and background."""
 
     def visuals(self, body: int) -> tuple[Visual, ...]:
         """Return the visual shapes of the body with this id."""
@@ -101,6 +112,8 @@ class Mesh:
     """(V, 2) texture coordinates, (0, 0) at the lower left."""
     texture: NDArray[np.uint8] | None = None
     """(H, W, 3) RGB, first row at the top."""
+    repeated: bool = False
+    """Whether the texture is a pattern that covers the mesh again and again."""
     material: bool = True
     """Whether the colours come from the file's materials, which a colour from the URDF replaces; a texture it tints."""
     closed: bool = True
@@ -135,6 +148,29 @@ class Mesh:
             positions=(self.positions @ linear.T + translation).astype(np.float32),
             normals=unit(self.normals @ np.linalg.inv(linear)).astype(np.float32),
             faces=np.ascontiguousarray(faces),
+        )
+
+    def covered(self, texture: NDArray[np.uint8], side: float) -> Mesh:
+        """Return the mesh without colours of its own, covered with a picture from six sides.
+
+        Args:
+            texture: (H, W, 3) RGB.
+            side: Width and height of the picture on the surface, m.
+        """
+        corners = self.positions[self.faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        axis = np.abs(across).argmax(axis=1)
+        used = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+        uv = np.take_along_axis(corners, used[:, None, :].repeat(3, axis=1), axis=2).reshape(-1, 2) / side
+        return replace(
+            self,
+            positions=corners.reshape(-1, 3),
+            normals=self.normals[self.faces].reshape(-1, 3),
+            colors=np.full((3 * len(self.faces), 4), 255, np.uint8),
+            faces=np.arange(3 * len(self.faces), dtype=np.uint32).reshape(-1, 3),
+            uv=uv.astype(np.float32),
+            texture=texture,
+            repeated=True,
         )
 
     def tinted(self, rgba: tuple[float, ...]) -> Mesh:
@@ -295,6 +331,8 @@ def parts_of(body: int, visuals: Sequence[Visual], load_mesh: Callable[[str], Se
     for visual, frame, mesh in found:
         for coarse in (False, True) if visual.link in heavy else (False,):
             drawn = mesh.coarse if coarse and mesh.coarse is not None else mesh
+            if visual.texture:
+                drawn = drawn.covered(load_texture(visual.texture), _TEXTURE)
             texture = None if drawn.texture is None else id(drawn.texture)
             key = (visual.link, coarse, texture, drawn.closed)
             groups.setdefault(key, []).append(drawn.tinted(visual.rgba).moved(frame))

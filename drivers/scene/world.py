@@ -17,6 +17,7 @@ from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupp
 from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
 
+from .disturbances import UNCHANGED, Randomized
 from .engine import AppliedForce, B, SceneEngine
 from .joints import joints_to_place, movable_joints, reset_positions
 from .states import check_state, structure_of
@@ -55,6 +56,10 @@ class SimulatedWorld(SceneEngine[B]):
         """Changes of poses other than by steps, and of looks."""
         self._edited_at = 0
         """The step after which the world was edited last."""
+        self.began_at = 0
+        """The step of the newest reset or edit of bodies: what was before is another scene."""
+        self.randomized = UNCHANGED
+        """What ``rig.world.randomize`` applied last."""
         self.forces: list[AppliedForce[B]] = []
         """Forces on links that act in the coming step."""
         self._gravity = list(spec.gravity)
@@ -401,10 +406,17 @@ class SimulatedWorld(SceneEngine[B]):
         self.paint_body(body, color)
         return self._edited("set_color", name=name, rgba=color)
 
+    def randomize(self, values: Mapping[str, Any], seed: int) -> int:
+        """Take the values that devices and pictures read (see :mod:`hal.randomization`) and return the new revision."""
+        self.randomized = Randomized.take(values, seed)
+        return self._edited("randomize", values=dict(values), seed=seed)
+
     def _edited(self, method: str, **params: Any) -> int:
         self._changes += 1
-        if method != "set_color":
+        if method in ("add", "remove"):
             self._edited_at = self.steps
+        if method != "set_color":
+            self.began_at = self.steps
         self.revision += 1
         for callback in self._on_edit:
             callback(method, params, self.revision)
@@ -427,6 +439,7 @@ class SimulatedWorld(SceneEngine[B]):
             q: Joint positions, rad or m; only with a name. For an arm, those of its joints, or of its joints and
                 fingers; for an object, those of all its movable joints.
         """
+        self.began_at = self.steps
         if name is None:
             if pose is not None or q is not None:
                 raise CommandError("reset with a pose or with q needs the name of a body", code="name_missing")
@@ -477,6 +490,7 @@ class SimulatedWorld(SceneEngine[B]):
         except (AttributeError, DeviceNotFound, CommandError, KeyError, ValueError, TypeError) as error:
             raise CommandError(f"the state cannot be restored: {error}", code="wrong_state") from error
         self.forces = forces
+        self.began_at = self.steps
         self._note_edit()
         self.place_attached()
         for name, (_, restore) in self._kept.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,6 +17,7 @@ from .context import Context, find_mesh, load_urdf
 from .files import Problems, find_file, read_yaml, suggest, validate
 from .models import FileSource
 from .schema import (
+    ENDS,
     Factor,
     Flag,
     Mass,
@@ -32,22 +33,13 @@ from .schema import (
     Strict,
     Unknown,
     ValueProblem,
+    check_order,
     describe,
 )
 
-_ENDS = "the least and the greatest"
-
-
-def _check_order(ends: tuple[float, float]) -> tuple[float, float]:
-    least, greatest = ends
-    if least > greatest:
-        raise ValueProblem(f"must be {_ENDS}; {least:g} is above {greatest:g}", "empty_range")
-    return ends
-
-
 _Two = tuple[float, float]
-Range = Annotated[_Two, Several(Quantity("m", -50.0, 50.0), 2, _ENDS), AfterValidator(_check_order)]
-Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, _ENDS), AfterValidator(_check_order)]
+Range = Annotated[_Two, Several(Quantity("m", -50.0, 50.0), 2, ENDS), AfterValidator(check_order)]
+Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, ENDS), AfterValidator(check_order)]
 
 
 class RandomPose(Strict):
@@ -163,16 +155,21 @@ class ObjectConfig(Strict):
         return self
 
 
-def load_objects(context: Context) -> tuple[BodySpec, ...]:
-    """Return the objects of a rig. Problems are added to ``context``; then the objects may be incomplete.
+def load_objects(context: Context, entries: Sequence[Any], section: str, taken: dict[str, str]) -> tuple[BodySpec, ...]:
+    """Return objects of a rig. Problems are added to ``context``; then the objects may be incomplete.
 
     The robots of the rig have been resolved before, so that their URDFs and other names of links are known.
+
+    Args:
+        context: The rig.
+        entries: The objects as written.
+        section: Key of the list of them.
+        taken: Names of the rig's robots and other objects, each with its place in words; the new ones are added.
     """
     bodies = []
     problems, source = context.problems, context.source
-    taken = {name: f"robots.{name} in {source}" for name in getattr(context.rig, "robots", ())}
-    for k, entry in enumerate(context.rig.objects):
-        key = f"objects.{k}"
+    for k, entry in enumerate(entries):
+        key = f"{section}.{k}"
         loaded = _load(entry, source, context.base, key, problems)
         if loaded is None:
             continue

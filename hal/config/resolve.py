@@ -19,13 +19,14 @@ from ..geometry import Pose
 from ..kinematics.collisions import in_one_place
 from ..kinematics.urdf import read_urdf
 from ..pads.model import pad_model
-from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RobotSpec, WorldSpec
+from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RandomizeSpec, RobotSpec, WorldSpec
 from .context import Context
 from .data_files import user_path
 from .files import find_file, read_yaml, suggest
 from .models import load_pad_models
 from .objects import load_objects
 from .resolve_cameras import resolve_camera
+from .resolve_randomize import resolve_randomize
 from .resolve_robots import resolve_robot
 from .rigfile import Device, PadConfig
 from .schema import Unknown
@@ -52,8 +53,13 @@ def resolve(context: Context) -> Plan:
     with suppress(Unknown):
         driver = _world_driver(context)
     bodies: tuple[BodySpec, ...] = ()
+    taken = {name: f"robots.{name} in {context.source}" for name in getattr(rig, "robots", ())}
     with suppress(Unknown):
-        bodies = load_objects(context)  # for a real rig, too, so that mistakes in objects are found there
+        # For a real rig, too, so that mistakes in objects are found there.
+        bodies = load_objects(context, rig.objects, "objects", taken)
+    randomize: RandomizeSpec | None = None
+    with suppress(Unknown):
+        randomize = resolve_randomize(context, robots, cameras, bodies, taken)
     boxes: tuple[BoxSpec, ...] = ()
     with suppress(Unknown):
         boxes = tuple(_collect_boxes(context, bodies))
@@ -61,7 +67,10 @@ def resolve(context: Context) -> Plan:
     context.problems.raise_any()
     wanted = rig.collisions
     physics = rig.simulation
-    world = WorldSpec(driver, physics.physics_hz, physics.gravity, bodies, robots) if driver is not None else None
+    world: WorldSpec | None = None
+    if driver is not None:
+        scene = bodies, robots, physics.shadows, randomize
+        world = WorldSpec(driver, physics.physics_hz, physics.gravity, *scene)
     return Plan(
         sim=context.rig_sim,
         clock=context.time,

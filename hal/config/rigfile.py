@@ -27,6 +27,7 @@ from ..registry import explain_engine
 from ..specs import ViewSpec
 from ..types import STREAMS
 from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, expand_names
+from .randomize import RandomizeConfig
 from .schema import (
     CameraRate,
     Coordinate,
@@ -353,6 +354,10 @@ class SimulationConfig(Strict):
     """``lock_step``: time advances only while the program waits. Default: real time; lock-step for the mock."""
     renderer: Literal["auto", "gl", "tiny"] = "auto"
     """``gl`` is moderngl, ``tiny`` PyBullet's own; ``auto`` is the first that works."""
+    shadows: Flag = True
+    """Whether pictures have shadows; ``tiny`` draws none."""
+    randomize: RandomizeConfig | None = None
+    """What ``rig.world.randomize(seed)``, and so every new episode, varies."""
 
 
 class BoxConfig(Strict):

@@ -169,6 +169,18 @@ class Several:
         return {"anyOf": [item, several]} if self.single else several
 
 
+ENDS = "the least and the greatest"
+"""Numbers of a range, for messages."""
+
+
+def check_order(ends: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the two ends of a range. Raises ValueProblem if the range is upside down."""
+    least, greatest = ends
+    if least > greatest:
+        raise ValueProblem(f"must be {ENDS}; {least:g} is above {greatest:g}", "empty_range")
+    return ends
+
+
 def _normalise(q: tuple[float, ...]) -> tuple[float, ...]:
     norm = math.hypot(*q)
     if abs(norm - 1.0) > 0.01:

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CommandError, MotionStopped
 from ..geometry import Pose
-from ..specs import BodySpec, RangesSpec
+from ..randomization import list_distractors
+from ..specs import BodySpec, RangesSpec, WorldSpec
 
 if TYPE_CHECKING:
     from ..clock import Clock
@@ -128,13 +129,14 @@ def sample_poses(rig: Rig, random: np.random.Generator, given: Collection[str] =
     if plan is None or not rig.has_world:
         return {}
     there = set(rig.world.bodies) - {robot.name for robot in plan.robots}
-    drawn = [(body, body.random) for body in plan.bodies if body.random and body.name in there - set(given)]
+    known = (*plan.bodies, *list_distractors(plan))
+    drawn = [(body, body.random) for body in known if body.random and body.name in there - set(given)]
     if not drawn:
         return {}
-    free = {body.name for body in plan.bodies if body.robot is not None or not (body.collision or body.urdf)}
+    free = {body.name for body in known if body.robot is not None or not (body.collision or body.urdf)}
     rest = sorted(there - free - {body.name for body, _ in drawn})
     still = {name: solid for name in rest if (solid := _find_solid(rig.world, name)) is not None}
-    home = {body.name: still[body.name] for body in plan.bodies if body.name in still and body.name not in given}
+    home = {body.name: still[body.name] for body in known if body.name in still and body.name not in given}
     movers = [_make_random_body(rig.world, body, ranges, None if body.name in free else home) for body, ranges in drawn]
     for _ in range(_ROUNDS):
         try:
@@ -246,6 +248,7 @@ def reset_scene(
     *,
     poses: Mapping[str, Pose] | None = None,
     random: np.random.Generator | None = None,
+    seed: int | None = None,
     deadman: Deadman | None = None,
     unattended: bool = False,
     since: int | None = None,
@@ -254,6 +257,7 @@ def reset_scene(
 ) -> dict[str, Pose]:
     """Bring a scene to its start: objects at their start poses and the arm at its start position.
 
+    Where the rig file has ``simulation.randomize``, the scene is varied, too (:meth:`hal.world.World.randomize`).
     A simulated arm is placed. Any other arm **drives** as ``move_to`` does, then opens its gripper. With a dead-man
     that takes a new press: a press that began before this call, or that followed a stop, does not start the motion.
 
@@ -263,7 +267,8 @@ def reset_scene(
         q: Its start position (n,), rad; None for its initial position in a simulated world, else home.
         poses: Poses of objects in the world, instead of sampled ones.
         random: Sample poses of objects with random ranges, see :func:`sample_poses`; None leaves them where they are
-            configured.
+            configured, and the scene as the rig file has it.
+        seed: Seed of what ``simulation.randomize`` varies; None samples one from ``random``.
         deadman: Dead-man for a real arm.
         unattended: Let a real arm drive without a dead-man.
         since: Count of presses that a new press must exceed; None for the count at this call.
@@ -271,7 +276,7 @@ def reset_scene(
         open_gripper: Whether a real gripper opens, which drops what it holds.
 
     Returns:
-        The poses of the objects that were placed.
+        The poses of the placed objects.
 
     Raises:
         MotionStopped: ``rig.stop()`` is not acknowledged, or the dead-man was not pressed or held within ``patience``
@@ -281,26 +286,42 @@ def reset_scene(
     inside = stands_in_world(rig, robot)
     if not inside:  # before the objects are placed: its mirror would push them
         if deadman is not None:
-            _wait_for_press(rig.clock, deadman, deadman.record.presses if since is None else since, patience)
+            _wait_for_press(rig.clock, deadman, since, patience)
         target = robot.home if q is None else np.asarray(q, float)
         robot.move_to(target, deadman=deadman, unattended=unattended, patience=patience)
         if open_gripper and robot.gripper is not None:
             robot.gripper.open()
     if not rig.has_world:
         return {}
+    _vary(rig.world, rig.plan.world, random, seed)
     rig.world.reset()
+    placed = _place_objects(rig, poses, random)
+    if inside:
+        rig.world.reset(robot.name, q=robot.spec.initial if q is None else np.asarray(q, float))
+    return placed
+
+
+def _place_objects(rig: Rig, poses: Mapping[str, Pose] | None, random: np.random.Generator | None) -> dict[str, Pose]:
+    """Place objects at given poses, and others at sampled ones; return all of them."""
     put = dict(poses or {})
     for name, pose in put.items():
         rig.world.reset(name, pose=pose)
     drawn = {} if random is None else sample_poses(rig, random, given=put)
     for name, pose in drawn.items():
         rig.world.reset(name, pose=pose)
-    if inside:
-        rig.world.reset(robot.name, q=robot.spec.initial if q is None else np.asarray(q, float))
     return put | drawn
 
 
-def _wait_for_press(clock: Clock, deadman: Deadman, since: int, patience: float) -> None:
+def _vary(world: World, spec: WorldSpec | None, random: np.random.Generator | None, seed: int | None) -> None:
+    """Vary the scene by a seed, or by one from ``random``; with neither it is as in the rig file."""
+    if spec is not None and spec.randomize is not None:
+        if seed is None and random is not None:
+            seed = int(random.integers(2**32))
+        world.randomize(seed)
+
+
+def _wait_for_press(clock: Clock, deadman: Deadman, since: int | None, patience: float) -> None:
+    since = deadman.record.presses if since is None else since
     for tick in clock.rate(_POLL_HZ):
         record = deadman.record
         if record.held and record.presses > since:

@@ -145,7 +145,7 @@ class EpisodeWorker:
             robot = rig.robots[r.robot or next(iter(rig.robots))]
             generator = np.random.default_rng(seed)
             try:
-                reset_scene(rig, robot, random=generator)
+                reset_scene(rig, robot, random=generator, seed=seed)
                 if "reset" in self._functions:
                     self._functions["reset"](rig, generator)
             except Exception as error:

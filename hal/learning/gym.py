@@ -292,7 +292,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Result:
         """Reset the scene; a real arm drives to its start, and opens its gripper.
 
-        Objects with random ranges start at poses sampled from ``np_random``.
+        Objects with random ranges start at poses sampled from ``np_random``. What ``simulation.randomize`` of the rig
+        varies is drawn with the seed, or with one from ``np_random``.
 
         Args:
             seed: Seed of ``np_random``; None continues its sequence.
@@ -301,7 +302,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
 
         Returns:
             The observation and ``info``; ``info["poses"]`` has the poses of the placed objects, if any: name -> (7,),
-            position in m and quaternion xyzw in the world.
+            position in m and quaternion xyzw in the world; ``info["randomization"]`` has the seed and the values of
+            ``rig.world.randomize``, if the rig varies.
 
         Raises:
             MotionStopped: After ``rig.stop()``. Only the operator, or a program that is responsible for safety, may
@@ -321,6 +323,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
                 robot.spec.initial if start is None else start,
                 poses=options.get("poses") if last else None,  # each reset places the objects again
                 random=self.np_random if last else None,
+                seed=seed if last else None,
                 deadman=self._deadman,
                 unattended=self._unattended,
             )
@@ -337,6 +340,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         info = self._info(observation)
         if put:
             info["poses"] = {name: pose_array(pose) for name, pose in put.items()}
+        if self.rig.has_world and (drawn := self.rig.world.randomization) is not None:
+            info["randomization"] = drawn
         return self._observation_dict(observation), info
 
     def _place(self, starts: Mapping[str, Any]) -> None:

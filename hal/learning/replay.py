@@ -14,6 +14,7 @@ from ..commands import JointChunk
 from ..control import Control
 from ..errors import CommandError, DatasetError
 from ..geometry import Pose
+from ..randomization import DISTRACTORS
 from ..recording.layout import GRIP_FORCE
 from ..types import Limited, RobotStatus
 
@@ -67,6 +68,8 @@ class RecordedTrajectory:
     lacks it."""
     objects: Mapping[str, Pose]
     """Poses of the objects in the first row, in the world; simulation only."""
+    randomization: Mapping[str, Any] | None
+    """What the scene was varied with, see :meth:`hal.world.World.randomize`; None without that."""
 
     @classmethod
     def from_episode(cls, episode: Episode, robot: Robot) -> RecordedTrajectory:
@@ -116,7 +119,8 @@ class RecordedTrajectory:
             q=rows("observation.state", own)[:, :n],
             tcp=rows("observation.tcp", slice(first, first + 3)),
             grip=np.stack([setpoint[:, n], forces], axis=1) if has_gripper else None,
-            objects=_objects(episode.columns),
+            objects=_distractors(episode.info) | _objects(episode.columns),
+            randomization=episode.info.get("randomization"),
         )
 
     @property
@@ -228,6 +232,13 @@ def list_other_arms(episode: Episode, name: str) -> list[str]:
 def _model(info: Mapping[str, Any], name: str) -> str:
     robots = info.get("rig", {}).get("resolved", {}).get("robots", ())
     return next((str(robot["model"]) for robot in robots if robot["name"] == name), "")
+
+
+def _distractors(info: Mapping[str, Any]) -> dict[str, Pose]:
+    """Return the poses at the start of the distractors, which have no columns."""
+    names = ((info.get("randomization") or {}).get("values") or {}).get(DISTRACTORS, ())
+    start = info.get("objects_at_start") or {}
+    return {name: Pose(start[name][:3], start[name][3:]) for name in names if name in start}
 
 
 def _objects(columns: Mapping[str, NDArray[Any]]) -> dict[str, Pose]:
@@ -372,10 +383,15 @@ class TrajectoryPlayer:
     def approach(self, patience: float = 60.0) -> None:
         """Drive to the first set-point, and place the objects of a simulated world where they were recorded.
 
+        If the rig file has ``simulation.randomize``, the scene is varied as it was in the recording.
+
         Raises:
             CommandError: An object is missing in this world (code ``missing_object``). Other errors are those of
                 :meth:`hal.robot.Robot.move_to`.
         """
+        plan = self.rig.plan.world
+        if self.rig.has_world and plan is not None and plan.randomize is not None:
+            self.rig.world.randomize(self.trajectory.randomization)
         there = set(self.rig.world.bodies) if self.rig.has_world else set(self.trajectory.objects)
         if missing := [name for name in self.trajectory.objects if name not in there]:
             raise CommandError(

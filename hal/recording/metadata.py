@@ -142,15 +142,17 @@ def _versions() -> dict[str, str]:
 
 
 def start_metadata(rig: Rig, cameras: Iterable[CameraBuffer]) -> dict[str, Any]:
-    """Return what is known when an episode starts: time, poses of objects, calibration of each camera."""
-    objects = {}
+    """Return what is known when an episode starts: time, poses of objects, calibration of each camera, what varies."""
+    objects, randomization = {}, None
     if rig.has_world:
+        randomization = rig.world.randomization
         seen = rig.world.poses().poses
         objects = {name: _pose(pose) for name, pose in seen.items() if name not in rig.robots}
     return {
         "started": datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         "clock": rig.plan.clock,
         "objects_at_start": objects,
+        "randomization": randomization,
         "cameras": {camera.camera.name: _camera(camera) for camera in cameras},
     }
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..errors import CommandError, ConnectionLost, DeviceNotFound, StaleStateError
+from ..randomization import list_distractors
 from ..types import AXES, BUTTONS, STREAMS, Frame, GripperState, PadState, RobotState, Stamp
 from .codecs import depth_unit_for
 from .layout import (
@@ -190,13 +191,17 @@ class RowSnapshot(NamedTuple):
 
 
 def movable_objects(rig: Rig) -> tuple[str, ...]:
-    """Return the names of the simulated objects that can move, or that have a random start pose."""
+    """Return the names of the simulated objects that can move, or that have a random start pose.
+
+    Without distractors, which are not in every episode: their poses at its start are in its metadata.
+    """
     if not rig.has_world or rig.plan.world is None:
         return ()
     bodies = rig.plan.world.bodies
     heavy = {body.name for body in bodies if body.urdf is not None or body.mass > 0.0}
     still = {body.name for body in bodies if body.random is None and (body.fixed or body.name not in heavy)}
     still |= {body.name for body in bodies if body.robot is not None}
+    still |= {body.name for body in list_distractors(rig.plan.world)}
     return tuple(name for name in rig.world.bodies if name not in still and name not in rig.robots)
 
 

@@ -182,3 +182,17 @@ class ServedRegression:
             steps += [[*(move / AHEAD), width]] * AHEAD
             tcp = after
         return {"actions": np.array(steps, np.float32)}
+
+
+def look(rig: hal.Rig, random: np.random.Generator) -> bool:
+    """Take the first picture of each camera into a file named after the episode's seed; then move a little."""
+    pictures = {}
+    for name, camera in rig.cameras.items():
+        frame = camera.read()
+        pictures |= {f"{name}.color": frame.color, f"{name}.depth": frame.depth}
+    drawn = rig.world.randomization
+    assert drawn is not None
+    np.savez(Path(os.environ["HAL_TEST_PICTURES"]) / f"{drawn['seed']}.npz", **pictures)
+    arm = next(iter(rig.robots.values()))
+    arm.move_to(arm.home + 0.02)
+    return True

@@ -386,3 +386,38 @@ def test_an_object_whose_urdf_is_broken(tmp_path: Path) -> None:
 def test_a_driver_whose_package_does_not_import() -> None:
     problem = only(robot(drivers={"sim": "no_such_lab.arm:DRIVER"}))
     assert (problem.key, problem.code) == ("robots.arm", "unknown_driver")
+
+
+RANDOMIZED = {"robots": {"arm": ROBOT}, "cameras": {"eye": CAMERA}, "objects": ["table", "cube"]}
+PICTURE = {"name": "ball", "shape": "sphere", "radius": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "code", "says"),
+    [
+        ({"light": {"intensity": [2.0, 1.0]}}, "light.intensity", "empty_range", "2 is above 1"),
+        ({"light": {"count": [1, 9]}}, "light.count", "out_of_range", "1 to 3"),
+        ({"light": {"count": [1, 1.5]}}, "light.count", "wrong_type", "whole numbers"),
+        ({"background": {"color": [[0, 0.9, 0], [1, 0.1, 1]]}}, "background.color", "empty_range", "green 0.9"),
+        ({"objects": {"cubee": {}}}, "objects.cubee", "unknown_object", "did you mean 'cube'"),
+        ({"objects": {"*": {"texture": ["wod"]}}}, "objects.*.texture.0", "unknown_texture", "did you mean 'wood'"),
+        ({"objects": {"cube": {"texture": ["no.png"]}}}, "objects.cube.texture.0", "missing_file", "there is no file"),
+        ({"objects": {"cube": {"texture": ["rig.txt"]}}}, "objects.cube.texture.0", "bad_texture", "PNG or JPEG"),
+        ({"objects": {"cube": {"mass": [1, 2]}}}, "objects.cube.mass", "unknown_key", "mass_scale"),
+        ({"robots": {"arm": {"links": {"hnd": {}}}}}, "robots.arm.links.hnd", "unknown_link", "did you mean 'hand'"),
+        ({"cameras": {"ear": {}}}, "cameras.ear", "unknown_camera", "available: *, eye"),
+        ({"cameras": {"*": {"latency_s": [0, 5]}}}, "cameras.*.latency_s", "out_of_range", "0 to 1 s"),
+        ({"distractors": {"objects": [PICTURE], "count": [0, 2]}}, "distractors.count", "out_of_range", "2 of 1"),
+        ({"distractors": {"objects": ["cube"], "count": [0, 1]}}, None, "duplicate_name", "cube"),
+    ],
+)
+def test_ranges_of_a_randomization(
+    section: dict[str, Any], key: str | None, code: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.txt").write_text("no picture")
+    problem = only(RANDOMIZED | {"simulation": {"randomize": section}})
+    assert problem.code == code
+    assert says in problem.message
+    if key is not None:
+        assert (problem.file, problem.key) == ("<dict>", f"simulation.randomize.{key}")
