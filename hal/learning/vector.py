@@ -361,7 +361,8 @@ class _Worlds:
                 seen, info = env.reset()
                 reward, terminated, truncated = 0.0, False, False
             else:
-                seen, reward, terminated, truncated, info = env.step(steps["action"][k].copy())
+                seen, paid, terminated, truncated, info = env.step(steps["action"][k].copy())
+                reward = float(paid)
             self._ended[k] = terminated or truncated
             if self._mode is AutoresetMode.SAME_STEP and self._ended[k]:
                 self._write(self._records.final, k, seen)

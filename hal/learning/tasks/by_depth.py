@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,7 @@ from ...geometry import Pose
 from ...observation import Observation
 from ...skills.depth import largest_cluster
 from ...types import Frame
-
-if TYPE_CHECKING:
-    from .task_env import TaskEnv
+from ..gym import RigEnv
 
 __all__ = ["DepthJudge", "find_cube", "select_points"]
 
@@ -53,7 +51,7 @@ class DepthJudge:
         NotSupported: An object is no cube (code ``not_by_depth``), or no camera has colour and depth (``no_depth``).
     """
 
-    def __init__(self, env: TaskEnv, entries: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, env: RigEnv, entries: Sequence[Mapping[str, Any]]) -> None:
         self._env = env
         self._cubes = [entry for entry in entries if entry.get("collision", True)]
         self.names = {entry["name"] for entry in self._cubes}
@@ -69,17 +67,16 @@ class DepthJudge:
         self.camera = cameras[0].name
         """Name of the camera."""
 
-    def find(self, observation: Observation) -> dict[str, Pose]:
-        """Return the pose in the arm's base frame of each cube that the newest picture shows."""
-        env, frame = self._env, observation.cameras[self.camera].frame
-        base = env.robot.base
+    def find(self, observation: Observation, centre: Array) -> dict[str, Pose]:
+        """Return the pose in the arm's base frame of each cube in the newest picture near ``centre`` (2,), m."""
+        base, frame = self._env.robot.base, observation.cameras[self.camera].frame
         if frame.T_world_camera is None:
             text = f"the pose of camera {self.camera} is unknown: calibrate it, or give it look_at in the rig file"
             raise NotSupported(text, code="no_camera_pose")
         eye = (base.inverse() @ frame.T_world_camera).position
         found = {}
         for entry in self._cubes:
-            points = select_points(frame, base, entry["rgba"][:3], env.centre)
+            points = select_points(frame, base, entry["rgba"][:3], centre)
             if len(points) >= _LEAST:
                 found[entry["name"]] = find_cube(points, 2.0 * entry["half_extents"][0], eye)
         return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,9 +12,7 @@ from ...geometry import Pose
 from ...gripper import Gripper
 from ...observation import Observation
 from ...robot import Robot
-
-if TYPE_CHECKING:
-    from .task_env import TaskEnv
+from ..gym import RigEnv
 
 __all__ = ["Hand", "fold", "yaw_of"]
 
@@ -40,7 +37,7 @@ class Hand:
         base: Base of the task's first arm in the world.
     """
 
-    def __init__(self, env: TaskEnv, robot: Robot, base: Pose) -> None:
+    def __init__(self, env: RigEnv, robot: Robot, base: Pose) -> None:
         self.robot = robot
         self._env = env
         self._base = base.inverse() @ robot.base
@@ -76,9 +73,9 @@ class Hand:
         """Whether the arm is at rest."""
         return bool(np.abs(self.seen.robots[self.robot.name].dq).max() < _STILL)
 
-    def holds(self, name: str, at: ArrayLike = (0.0, 0.0, 0.0)) -> bool:
+    def holds(self, thing: Pose, at: ArrayLike = (0.0, 0.0, 0.0)) -> bool:
         """Return whether the fingers press on something, and a point of the object (3,), m, is where they are."""
-        near = np.linalg.norm(self._env.poses[name].transform(at) - self.tcp.position) < GRASP_HEIGHT
+        near = np.linalg.norm(thing.transform(at) - self.tcp.position) < GRASP_HEIGHT
         return bool(near) and bool(self.seen.grippers[self.robot.name].grasped)
 
     def twist(self, velocity: Array, most: Array) -> list[float]:

@@ -46,7 +46,7 @@ class HandOver(TaskEnv):
 
     def held(self) -> tuple[bool, bool]:
         """Return whether the left and the right hand hold the bar at their ends."""
-        left, right = (hand.holds("bar", end) for hand, end in zip(self.hands, ENDS, strict=True))
+        left, right = (hand.holds(self.poses["bar"], end) for hand, end in zip(self.hands, ENDS, strict=True))
         return left, right
 
     def success(self) -> bool:

@@ -75,7 +75,7 @@ class PegInHole(TaskEnv):
             return 0.0
         peg = self.poses["peg"]
         near = closeness(self.tcp.position, peg.transform((0.0, 0.0, GRASPED - LENGTH / 2)))
-        brought = (self.hands[0].holds("peg") or self.inserted()) * (1.0 + closeness(self.off(), np.zeros(3)))
+        brought = (self.holds("peg") or self.inserted()) * (1.0 + closeness(self.off(), np.zeros(3)))
         return -1.0 + (near + brought) / 3.0
 
     def solve(self) -> Iterator[Action]:

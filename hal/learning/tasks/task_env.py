@@ -176,17 +176,7 @@ class TaskEnv(RigEnv):
             render_mode=render_mode,
         )
         try:
-            self.hands = tuple(Hand(self, arm.robot, self.robot.base) for arm in self._arms)
-            """The arms with their grippers."""
-            for hand in self.hands:
-                hand.check_gripper(self.width)
-            self._judge = DepthJudge(self, self.objects) if by_depth else None
-            if self._judge is not None:
-                self._cameras = (self._judge.camera,)  # no other picture is waited for
-            if not by_depth and not stands_in_world(self.rig, self.robot):
-                raise CommandError("judge='truth' is for simulated arms; use judge='depth'", code="bad_judge")
-            self.centre, self._above = self._find_centre(_DISTANCES if distance is None else (distance,))
-            """Middle of the work area (2,) in the arm's base frame, m; it ends :data:`AREA` from there."""
+            self._check_bench(by_depth, _DISTANCES if distance is None else (distance,))
         except BaseException:
             self.rig.close()
             raise
@@ -194,12 +184,12 @@ class TaskEnv(RigEnv):
         self._grips = [OPEN] * len(self.hands)
         self._track: list[dict[str, Pose]] = []
         """The newest poses of the objects, one for each step."""
-        self.action_space: Box = Box(-1.0, 1.0, (5 * len(self.hands),), np.float32)  # type: ignore[assignment]
+        self.action_space: Box = Box(-1.0, 1.0, (5 * len(self.hands),), np.float32)
         self._bounds = self._find_bounds()
         boxes: dict[str, Space[Any]] = {
             name: Box(low, high, dtype=np.float32) for name, (low, high) in self._bounds.items()
         }
-        self.observation_space: Dict = Dict(boxes)  # type: ignore[assignment]  # gymnasium's is invariant
+        self.observation_space: Dict = Dict(boxes)
 
     # What a task overrides.
 
@@ -238,7 +228,7 @@ class TaskEnv(RigEnv):
 
     def holds(self, name: str) -> bool:
         """Return whether the first arm's fingers press on something, and the object is where the fingers are."""
-        return self.hands[0].holds(name)
+        return self.hands[0].holds(self.poses[name])
 
     def speed(self, name: str) -> float:
         """Return the speed of an object, m/s; of one that a camera sees, its mean of 10 steps."""
@@ -344,6 +334,20 @@ class TaskEnv(RigEnv):
 
     # Details.
 
+    def _check_bench(self, by_depth: bool, distances: tuple[float, ...]) -> None:
+        """Check the grippers, and find the camera of the judge and the middle of the work area."""
+        self.hands = tuple(Hand(self, arm.robot, self.robot.base) for arm in self._arms)
+        """The arms with their grippers."""
+        for hand in self.hands:
+            hand.check_gripper(self.width)
+        self._judge = DepthJudge(self, self.objects) if by_depth else None
+        if self._judge is not None:
+            self._cameras = (self._judge.camera,)  # no other picture is waited for
+        elif not stands_in_world(self.rig, self.robot):
+            raise CommandError("judge='truth' is for simulated arms; use judge='depth'", code="bad_judge")
+        self.centre, self._above = self._find_centre(distances)
+        """Middle of the work area (2,) in the arm's base frame, m; it ends :data:`AREA` from there."""
+
     def _observation_dict(self, observation: Observation) -> ObservationDict:
         """Return an observation, and note the poses of the objects."""
         seen = super()._observation_dict(observation)
@@ -353,7 +357,7 @@ class TaskEnv(RigEnv):
             shown |= {lead + name: seen[lead + name] for name in ("q", "dq", "gripper")}
             shown[lead + "tcp"] = pose_array(hand.tcp)
         if self._judge is not None:
-            found = self._judge.find(observation)
+            found = self._judge.find(observation, self.centre)
             self.hidden = self._judge.names - found.keys()
             self.poses |= found
         else:
