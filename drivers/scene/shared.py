@@ -132,7 +132,10 @@ class SharedWorld(WorldDriver):
         if told["scene"] != own:
             self.close()
             raise ConfigError([_other_scene(own, told["scene"])])
-        self.warnings = [*told["warnings"], "the objects are those of the emulator's world, which goes on without this rig"]
+        self.warnings = [
+            *told["warnings"],
+            "the objects are those of the emulator's world, which goes on without this rig",
+        ]
         for method, params in self._edits:
             self._ask(method, params)
         self._poses = Connection.to(self._address, role="poses")
@@ -287,7 +290,8 @@ def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
     words = [word for value in overrides for word in ("--set", value)]
     command = [sys.executable, "-m", "hal.drivers.scene.world_server", "--config", config, *words]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdin is not None and process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout is not None
         try:
             line = process.stdout.readline().strip()
             if line not in ("ready", "shared"):

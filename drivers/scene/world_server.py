@@ -1,12 +1,14 @@
-"""The program that steps the world of emulated arms: ``python -m hal.drivers.scene.world_server --config yam_emulator``.
+"""The program that steps the world of emulated arms: ``python -m hal.drivers.scene.world_server --config RIG``.
 
-Emulators start it with ``--config``. Time in the world is that of their arms: each is placed where it was at the time of
-the step, so a busy computer makes the world late, and no motion in it faster. Fingers follow those of the emulators, which stop where the world says.
+Emulators start it. Time in the world is that of their arms: each is placed where it was at the time of a step, so a
+busy computer makes the world late, and no motion in it faster. The world's fingers are a little ahead of the emulated
+ones, and press as these do; these stop where the world's meet an object.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import math
 import os
@@ -38,8 +40,8 @@ _SILENT = 1.0
 """Time without a report after which the world does not wait for an arm, s."""
 _FASTEST = 20.0
 """Joint speed, rad/s, from which on an arm counts as placed elsewhere."""
-_FINGER_LEAD = 0.015
-"""Time, s, by which the fingers' target leads: what reports and motors are late."""
+_FINGER_LEAD = 0.045
+"""Time, s, by which the fingers lead: the emulated ones have to know of an object before they are there."""
 _FINGER_SPEED = 3.0
 """The world's fingers may be so many times as fast as the emulated ones, so that they can follow."""
 _TOUCHED = 0.02
@@ -114,7 +116,8 @@ class ArmOfWorld:
     def _drive_fingers(self) -> None:
         """Let the fingers follow those of the emulator, or press as they do."""
         fingers, width = self._fingers, self._width
-        assert fingers is not None and width is not None
+        assert fingers is not None
+        assert width is not None
         spec = fingers.spec
         if self._force > 0.0:
             wanted = (spec.width_min, self._force)
@@ -147,7 +150,8 @@ class ArmOfWorld:
                     side.setdefault(contact["b"], []).append(contact["normal"])
         one, other = touched[0], touched[-1]
         return any(
-            float(np.mean(one[thing], axis=0) @ np.mean(other[thing], axis=0)) < _OPPOSITE for thing in one.keys() & other
+            float(np.mean(one[thing], axis=0) @ np.mean(other[thing], axis=0)) < _OPPOSITE
+            for thing in one.keys() & other
         )
 
 
@@ -234,10 +238,8 @@ class WorldServer:
         return {"steps": world.steps, "revision": world.revision, "snapshot": world.snapshot()}
 
     def _send(self, descriptor: int, message: Any) -> None:
-        try:
+        with contextlib.suppress(ConnectionLost):  # the poller reports its end
             self._clients[descriptor].send(message)
-        except ConnectionLost:
-            pass  # the poller reports its end
 
     def _accept(self, listener: socket.socket) -> None:
         sock, _ = listener.accept()
@@ -265,7 +267,8 @@ class WorldServer:
     def _greet(self, descriptor: int, message: Mapping[str, Any]) -> None:
         role = message["role"]
         if role == "arm":
-            self._arms_of[descriptor] = self.arms[message["name"]]
+            arm = self._arms_of[descriptor] = self.arms[message["name"]]
+            self._send(descriptor, {"object": arm.object_width})
         elif role == "requests":
             if self.world.revision:
                 self._restart()
@@ -278,7 +281,9 @@ class WorldServer:
         """Undo what a program that is gone added, removed and painted: the next one does not know of it."""
         self.world.close()
         self._build()
-        self._arms_of = {descriptor: self.arms[arm.name] for descriptor, arm in self._arms_of.items()}
+        for descriptor, arm in self._arms_of.items():
+            self._arms_of[descriptor] = self.arms[arm.name]
+            self._send(descriptor, {"object": None})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

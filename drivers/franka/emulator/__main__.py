@@ -122,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--config",
         metavar="RIG",
-        help="put the arm into the simulated world of this rig, whose objects its fingers meet: a name in config/, or a path",
+        help="put the arm into the simulated world of this rig, whose objects the fingers meet (a name, or a path)",
     )
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
     add("--no-hand", action="store_true", help="serve the arm only")
@@ -155,7 +155,9 @@ def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | 
     rig = load(options.config, sim=False, overrides=options.set).resolve()
     arm = next((arm for arm in rig.robots if arm.driver == "franka" and arm.options.get("host") == options.host), None)
     if arm is None:
-        raise ValueError(f"{options.config} has no Franka at {options.host}: change --host, or --set robots.NAME.real.host")
+        raise ValueError(
+            f"{options.config} has no Franka at {options.host}: change --host, or --set robots.NAME.real.host"
+        )
     stack.enter_context(run_world(options.config, options.set))
     world = ArmInWorld(address_of(arm), arm.name)
     stack.callback(world.close)
