@@ -20,7 +20,7 @@ from typing import Any
 
 from hal.config.loader import load
 from hal.errors import ConfigError, ConnectionLost, Problem
-from hal.host.process import pack_error, unpack_error
+from hal.host.process import unpack_error
 from hal.specs import RobotSpec, WorldSpec, to_json
 from hal.world import WorldDriver
 
@@ -138,12 +138,15 @@ class SharedWorld(WorldDriver):
         ]
         for method, params in self._edits:
             self._ask(method, params)
+        self.steps = 0
         self._poses = Connection.to(self._address, role="poses")
         self._take(self._poses.receive())
         self._poses.sock.setblocking(False)
 
     def _take(self, state: Mapping[str, Any]) -> None:
-        self.steps, self.revision, self._values = state["steps"], state["revision"], state["snapshot"]
+        """Take a state of the world, unless a later one came with an answer."""
+        if state["steps"] >= self.steps:
+            self.steps, self.revision, self._values = state["steps"], state["revision"], state["snapshot"]
 
     @property
     def version(self) -> tuple[int, int]:
@@ -176,6 +179,7 @@ class SharedWorld(WorldDriver):
         answer = self._requests.receive()
         if "error" in answer:
             raise unpack_error(answer["error"])
+        self._take(answer["state"])
         return answer["result"]
 
     def follow(self, name: str, q: Sequence[float], dq: Sequence[float], width: float | None = None) -> None:
@@ -299,11 +303,3 @@ def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
             yield
         finally:
             process.stdin.close()  # it ends
-
-
-def answer_request(world: WorldDriver, message: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the answer to a request of a :class:`SharedWorld`."""
-    try:
-        return {"result": world.request(message["method"], message["params"])}
-    except Exception as error:
-        return {"error": pack_error(error)}

@@ -27,10 +27,11 @@ import numpy as np
 from hal import registry
 from hal.config.loader import load
 from hal.errors import ConnectionLost, HalError
+from hal.host.process import pack_error
 from hal.specs import RobotSpec, WorldSpec
 
 from .gripper import SimulatedGripper
-from .shared import Connection, address_of, answer_request, scene_of
+from .shared import Connection, address_of, scene_of
 
 __all__ = ["ArmOfWorld", "WorldServer", "main"]
 
@@ -256,13 +257,21 @@ class WorldServer:
                 elif descriptor in self._arms_of:
                     self._arms_of[descriptor].take(message)
                 else:
-                    client.send(answer_request(self.world, message))
+                    client.send(self._answer(message))
         except (ConnectionLost, KeyError, TypeError, ValueError):
             self._poller.unregister(client.sock)
             del self._clients[descriptor]
             self._roles.pop(descriptor, None)
             self._arms_of.pop(descriptor, None)
             client.close()
+
+    def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer to a request of :class:`.shared.SharedWorld`, with the state after it."""
+        try:
+            result = self.world.request(message["method"], message["params"])
+        except Exception as error:
+            return {"error": pack_error(error)}
+        return {"result": result, "state": self._state()}
 
     def _greet(self, descriptor: int, message: Mapping[str, Any]) -> None:
         role = message["role"]
