@@ -132,20 +132,21 @@ def pick_and_place(rig: hal.Rig, bench: Bench, tries: int, seed: int = 0, speed:
         rig.clock.sleep(0.1)
         up = rig.world.pose("cube").position[2] - before[2]
         width, way = gripper.state().width, np.append(goal - before[:2], 0.0)
+        over, down = (hal.Pose(done.tcp.position + way + z, done.tcp.orientation) for z in ([0, 0, 0], [0, 0, -LIFT]))
+        reason = "" if up > 0.9 * LIFT else "not up"
         try:
-            for shift in (way, way - [0.0, 0.0, LIFT]):
-                arm.move_to(
-                    hal.Pose(done.tcp.position + shift, done.tcp.orientation),
-                    straight=True, speed=speed, unattended=True,
-                )  # fmt: skip
-            reason = "" if up > 0.9 * LIFT else "not up"
-        except hal.HalError as error:
-            reason = str(getattr(error, "code", "") or type(error).__name__)
+            for there in (over, down):
+                arm.move_to(there, straight=True, speed=speed, unattended=True)
+        except (hal.Unreachable, hal.CommandError) as error:
+            reason = error.code
         gripper.open()
         rig.clock.sleep(0.2)
         off = float(np.linalg.norm(rig.world.pose("cube").position[:2] - goal))
         yield Try(reason or ("" if off < NEAR else "not there"), width, off)
-        arm.move_to(arm.home, speed=speed, unattended=True)
+        if reason:
+            arm.move_to(arm.home, speed=speed, unattended=True)
+        else:
+            arm.move_to(over, straight=True, speed=speed, unattended=True)
 
 
 def summarise(found: list[Try]) -> str:
