@@ -115,7 +115,7 @@ def test_an_episode_of_pick_and_place_is_recorded_and_replayed(fr3: Bench, tmp_p
     shown = run_here(replay, str(tmp_path / "data"), "--unattended", *fr3.words)
     assert shown.returncode == 0, shown.stdout + shown.stderr
     with fr3.open() as rig:  # the emulator's world goes on between programs
-        assert rig.world.pose("cube").position == pytest.approx(put, abs=5e-3)
+        assert rig.world.pose("cube").position == pytest.approx(put, abs=tries.NEAR)
 
 
 def miss_and_lose(rig: hal.Rig) -> None:
@@ -151,7 +151,8 @@ def test_fingers_on_a_bus_hold_miss_and_lose(can: Bench) -> None:
         done = grasp(arm, prepare(rig), width=0.03, hold=0.3, **OPTIONS)
         assert done, done.message
         assert done.width == pytest.approx(0.03, abs=1e-3)
-        assert rig.world.pose("cube").position[2] - AREA.cube["position"][2] > 0.05
+        bottom = AREA.cube["position"][2]
+        wait_until(lambda: rig.world.pose("cube").position[2] - bottom > 0.05, "lifted")  # the world may be late
         assert arm.gripper is not None
         assert arm.gripper.state().force == pytest.approx(arm.gripper.spec.force, rel=0.2)
         miss_and_lose(rig)
