@@ -94,6 +94,9 @@ class DriverSpec:
     world: str | None = None
     """A :class:`~hal.world.WorldDriver`, which makes this driver an engine of the simulation: the world of its arms,
     grippers and cameras."""
+    shared_world: str | None = None
+    """"module:function" of the record of a world that has only mirrors of emulated arms: it returns the world that
+    their emulators share, as a :class:`~hal.world.WorldDriver`, or None."""
     viewer: str | None = None
     """A window with the simulated world: :class:`~hal.views.Viewer`."""
     viewer3d: str | None = None

@@ -5,6 +5,7 @@ from hal.registry import DriverSpec
 DRIVER = DriverSpec(
     name="mujoco",
     world="hal.drivers.mujoco.world:MujocoWorld",
+    shared_world="hal.drivers.scene.shared:join_world",
     robot="hal.drivers.mujoco.robot:MujocoRobot",
     gripper="hal.drivers.mujoco.gripper:MujocoGripper",
     camera="hal.drivers.scene.camera:SimulatedCamera",

@@ -8,6 +8,7 @@ from hal.registry import DriverSpec
 DRIVER = DriverSpec(
     name="pybullet",
     world="hal.drivers.pybullet.world:PyBulletWorld",
+    shared_world="hal.drivers.scene.shared:join_world",
     robot="hal.drivers.pybullet.robot:PyBulletRobot",
     gripper="hal.drivers.pybullet.gripper:PyBulletGripper",
     camera="hal.drivers.scene.camera:SimulatedCamera",

@@ -26,7 +26,7 @@ from ..servo.audit import SetpointAudit
 from ..servo.controllers import controller_of
 from ..servo.servo import Servo
 from ..servo.watchdog import is_alive
-from ..specs import GroupSpec, RobotSpec
+from ..specs import GroupSpec, RobotSpec, WorldSpec
 from ..types import RobotStatus
 from .gripper_unit import GripperUnit
 from .guards import guard_arms
@@ -379,6 +379,14 @@ LOWER_LIMIT = 7.0
 """Longest time for lowering arms without brakes before they are closed anyway, s."""
 
 
+def _open_world(group: GroupSpec, spec: WorldSpec) -> Any:
+    """Return the group's world: that of the emulators of its arms if they share one, else one of its own."""
+    driver = registry.driver(spec.driver)
+    find = registry.function(spec.driver, driver.shared_world) if group.clock == "real_time" else None
+    shared = find(spec) if find is not None else None
+    return shared if shared is not None else registry.load(spec.driver, "world")(spec)
+
+
 class Cycle:
     """A group: its world, if any, its arms and its grippers."""
 
@@ -403,7 +411,7 @@ class Cycle:
         """Runs one whole cycle, in the middle of a request; the host sets its own, which waits for the cycle's time."""
         self.world: Any = None
         if spec.world is not None:
-            self.world = registry.load(spec.world.driver, "world")(spec.world)
+            self.world = _open_world(spec, spec.world)
         self.arms = {r.name: ArmUnit(r, self.dt, memory.robots[r.name], self.world) for r in spec.robots}
         self._arm_units = tuple(self.arms.values())
         self.notes = guard_arms(spec, self.arms, others)

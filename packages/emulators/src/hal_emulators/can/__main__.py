@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import sys
 import threading
@@ -15,6 +16,7 @@ except ModuleNotFoundError:
 
 from hal.errors import ControlTaken, HalError
 from hal.lock import DeviceLock
+from hal_emulators.shared_world import has_world, run_world
 
 from .console import CommandPort, help_text, serve_prompt
 from .server import CanEmulator
@@ -39,12 +41,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
     parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
     parser.add_argument("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
+    parser.add_argument(
+        "--no-world",
+        action="store_true",
+        help="leave out the rig's simulated world: the fingers meet only what the command `object` names",
+    )
     options = parser.parse_args(arguments)
     end = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: end.set())
     try:
-        built = CanEmulator(options.config, options.set, options.seed, realtime=True)
+        _run(options, end)
+    except (HalError, can.CanError, OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _run(options: argparse.Namespace, end: threading.Event) -> None:
+    with contextlib.ExitStack() as stack:
+        in_world = not options.no_world and has_world(options.config, options.set)
+        if in_world:
+            stack.enter_context(run_world(options.config, options.set))
+        built = CanEmulator(options.config, options.set, options.seed, realtime=True, in_world=in_world)
         _lock_buses(built)
         with built as emulator:
             port = CommandPort(emulator, options.port)
@@ -56,10 +75,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     if bus.error is not None:
                         raise bus.error
             port.close()
-    except (HalError, can.CanError, OSError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
 
 
 def _lock_buses(emulator: CanEmulator) -> None:

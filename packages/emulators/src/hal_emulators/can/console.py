@@ -199,6 +199,8 @@ def _push(target: _Target, words: list[str]) -> None:
 
 
 def _object(target: _Target, words: list[str]) -> None:
+    if target.arm.world is not None:
+        raise ValueError("the fingers meet the objects of the simulated world: use rig.world, or --no-world")
     target.arm.set_object(None if words[0] == "none" else _float(words[0], "the width in m", 0.0))
 
 

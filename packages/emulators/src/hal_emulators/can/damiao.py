@@ -32,6 +32,7 @@ from hal.drivers.can.damiao_protocol import (
 )
 from hal.drivers.can.settings import DamiaoArmSettings, DamiaoGripperSettings, DamiaoMotorSettings
 from hal.specs import RobotSpec
+from hal_emulators.shared_world import ArmInWorld
 
 from .plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
 
@@ -54,6 +55,8 @@ _MECHANICS = {
 """Inertia and viscous friction are chosen, between those of several published models; Coulomb friction: i2rt's
 yam_v1.yml for the first two; torque: TMAX."""
 _AMBIENT = 30
+_NEAR = 1e-3
+"""Fingers that are no farther than this from an object, m, press on it."""
 
 
 def shorted_damping(motor_type: str) -> float:
@@ -153,6 +156,7 @@ class EmulatedDamiaoArm:
         motors: The motors by their number (their id), those of the arm first.
         plant: The arm's mechanics.
         gripper: The gripper's; None without one.
+        world: The simulated world that it is in; None for none.
     """
 
     def __init__(self, spec: RobotSpec) -> None:
@@ -168,6 +172,7 @@ class EmulatedDamiaoArm:
             self.plant.load(payload=(spec.payload.mass, spec.payload.position))
         self.gripper: GripperPlant | None = None
         self._gripper_motor: DamiaoMotor | None = None
+        self._object_width: float | None = None
         self.widths: tuple[tuple[float, float], ...] = ()
         if spec.gripper is not None and spec.gripper.driver == spec.driver:
             settings = DamiaoGripperSettings.of(spec.gripper)
@@ -179,6 +184,7 @@ class EmulatedDamiaoArm:
         self.ids = frozenset(self.motors)
         self.peak: list[float] = [0.0] * len(arm)
         """Greatest speed of each joint since the last reset, rad/s."""
+        self.world: ArmInWorld | None = None
 
     def take(self, id: int, data: bytes, send: Send) -> None:
         """Take a frame from the bus, and answer it."""
@@ -227,6 +233,22 @@ class EmulatedDamiaoArm:
         self.peak = [max(peak, abs(speed)) for peak, speed in zip(self.peak, self.plant.dq.tolist(), strict=True)]
         if self.gripper is not None and self._gripper_motor is not None:
             self.gripper.step(dt, self._gripper_motor.step(dt))
+        if self.world is not None:
+            if self.gripper is not None:
+                self._meet(self.world, self.gripper)
+            self.world.exchange(dt, self.plant.q.tolist())
+
+    def _meet(self, world: ArmInWorld, gripper: GripperPlant) -> None:
+        """Let an object in the world stop the fingers, and press on it with what the motor has beyond its friction."""
+        (a0, w0), (a1, w1) = self.widths[0], self.widths[-1]
+        slope = (w1 - w0) / (a1 - a0)
+        if world.object_width != self._object_width:
+            self._object_width = world.object_width
+            self.set_object(self._object_width)
+        closing = -gripper.tau * math.copysign(1.0, slope) - gripper.coulomb
+        width = w0 + (gripper.q - a0) * slope
+        pressing = self._object_width is not None and width < self._object_width + _NEAR
+        world.fingers = width, max(closing / abs(slope), 0.0) if pressing else 0.0
 
     def report(self) -> dict[str, Any]:
         """Return the state of every motor, for programs and people."""

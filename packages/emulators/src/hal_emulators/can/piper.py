@@ -42,8 +42,9 @@ from hal.drivers.can.piper_protocol import (
     encode_pose,
     firmware_pieces,
 )
-from hal.drivers.can.settings import PiperArmSettings
+from hal.drivers.can.settings import PiperArmSettings, PiperGripperSettings
 from hal.specs import RobotSpec
+from hal_emulators.shared_world import ArmInWorld
 
 from .plant import OFF, ArmPlant, Drive, JointMechanics
 
@@ -76,6 +77,7 @@ class EmulatedPiperArm:
         plant: The arm's mechanics.
         status: Code of the arm's state (see ``ARM_STATUS``); 0 is normal.
         firmware: Version that it reports.
+        world: The simulated world that it is in; None for none.
     """
 
     def __init__(self, spec: RobotSpec) -> None:
@@ -94,6 +96,10 @@ class EmulatedPiperArm:
         self.peak: list[float] = [0.0] * JOINTS
         """Greatest speed of each joint since the last reset, rad/s."""
         self.commands = 0
+        self.world: ArmInWorld | None = None
+        gripper = spec.gripper
+        own = gripper is not None and gripper.driver == spec.driver
+        self._force_per_torque = PiperGripperSettings.of(gripper).force_per_torque if gripper and own else 0.0
         self._since_report = self._since_slow = 0.0
         self.restart()
 
@@ -186,7 +192,12 @@ class EmulatedPiperArm:
             drives.append(Drive(self._set_q[k], self._set_dq[k], _STIFFNESS, _DAMPING, weight))
         self.plant.step(dt, drives)
         self.peak = [max(peak, abs(speed)) for peak, speed in zip(self.peak, self.plant.dq.tolist(), strict=True)]
+        if self.world is not None:
+            self._object = self.world.object_width or 0.0
         self._step_gripper(dt)
+        if self.world is not None:
+            self.world.fingers = self.gripper_width, -self._gripper_torque * self._force_per_torque
+            self.world.exchange(dt, self.plant.q.tolist())
         self._since_report += dt
         self._since_slow += dt
         if self._since_report >= _REPORT - 1e-9:

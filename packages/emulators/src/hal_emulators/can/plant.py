@@ -222,6 +222,8 @@ class GripperPlant:
     def __init__(self, mechanics: JointMechanics, q: float, lower: float, upper: float) -> None:
         """Build one at ``q``, which can turn from ``lower`` to ``upper``, rad."""
         self._mechanics = mechanics
+        self.coulomb = mechanics.coulomb
+        """Coulomb friction, Nm."""
         self.q, self.dq, self.tau = q, 0.0, 0.0
         self.lower, self.upper = lower, upper
         """Where the fingers meet a stop or an object, rad."""

@@ -21,7 +21,9 @@ import can
 
 from hal.config.loader import load
 from hal.drivers.can.settings import BusSettings
+from hal.drivers.scene.shared import address_of
 from hal.specs import RobotSpec
+from hal_emulators.shared_world import ArmInWorld
 
 from .damiao import EmulatedDamiaoArm
 from .piper import EmulatedPiperArm
@@ -45,6 +47,7 @@ class EmulatedArm(Protocol):
     bus: BusSettings
     plant: ArmPlant
     peak: list[float]
+    world: ArmInWorld | None
 
     @property
     def numbers(self) -> Sequence[int]:
@@ -259,6 +262,7 @@ class CanEmulator:
         overrides: Sequence[str] = (),
         seed: int = 0,
         realtime: bool = False,
+        in_world: bool = False,
     ) -> None:
         """Build the arms of a rig that have a CAN driver and are not simulated.
 
@@ -267,15 +271,19 @@ class CanEmulator:
             overrides: Changes of it, as for :func:`hal.open`.
             seed: Of random losses.
             realtime: Give its threads the priority of a servo, for a process that does nothing else.
+            in_world: Put the arms into the simulated world that :func:`hal.drivers.scene.shared.run_world` runs.
 
         Raises:
             ConfigError: The rig has problems.
             ValueError: It has no arm on a CAN bus.
+            ConnectionLost: There is no such world.
         """
         specs = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in _ARMS]
         if not specs:
             raise ValueError("this rig has no arm on a CAN bus that is not simulated")
         self.arms: dict[str, EmulatedArm] = {spec.name: _ARMS[spec.driver](spec) for spec in specs}
+        for spec in specs if in_world else ():
+            self.arms[spec.name].world = ArmInWorld(address_of(spec), spec.name)
         keys = {arm.bus.key: arm.bus for arm in self.arms.values()}
         self.buses = [
             EmulatedBus(settings, [arm for arm in self.arms.values() if arm.bus.key == key], seed, realtime)

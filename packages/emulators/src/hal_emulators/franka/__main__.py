@@ -12,7 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hal.config.data_files import find_data
+from hal.config.loader import load
 from hal.drivers.franka.limits import LIMITS
+from hal.drivers.scene.shared import address_of
+from hal.errors import HalError
+from hal_emulators.shared_world import ArmInWorld, run_world
 
 from .arm import EmulatedArm, RobotFiles
 from .console import CommandConsole, Executor
@@ -44,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             gc.freeze()
             journal.print(greeting)
             server.run()
-    except (OSError, ValueError) as error:
+    except (HalError, OSError, ValueError) as error:
         text = error.strerror if isinstance(error, OSError) and error.strerror else error
         print(f"error: {text}", file=sys.stderr)
         return 1
@@ -57,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) -> tuple[ArmServer, str]:
     """Return the server, ready to run, and the line that announces it. Raises OSError and ValueError."""
     title, model, version = _ROBOTS[options.robot]
+    world = _enter_world(options, stack)
     urdf = options.urdf or find_data("robots", f"{options.robot}.urdf")
     bare = arm_only(urdf.read_text(encoding="utf-8"))
     files = RobotFiles(bare.encode(), write_model_library(bare) if version == 5 else b"")
@@ -67,7 +72,8 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
     pacing = Pacing(options.lockstep, not (options.lockstep and options.unpaced), options.patience)
     server = ArmServer(options.host, arm, files, pacing, options.seed)
     stack.callback(server.close)
-    hand = _hand(options)
+    server.world = world
+    hand = _hand(options, world)
     if hand is not None:
         hand.start()
         stack.callback(hand.stop)
@@ -114,6 +120,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--q", type=float, nargs=7, default=_HOME, metavar="RAD", help="joint positions at the start (home)")
     add("--urdf", type=Path, help="the arm's URDF (the project's own)")
     add("--end-effector", choices=("hand", "none"), default="hand", help="tool on the flange (%(default)s)")
+    add(
+        "--config",
+        metavar="RIG",
+        help="put the arm into the simulated world of this rig, whose objects the fingers meet (a name, or a path)",
+    )
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
     add("--no-hand", action="store_true", help="serve the arm only")
     add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
     add("--quiet", action="store_true", help="print no events")
@@ -129,12 +141,28 @@ def _plant(options: argparse.Namespace, urdf: Path) -> Plant:
     return IdealPlant(body, options.q)
 
 
-def _hand(options: argparse.Namespace) -> Any:
+def _hand(options: argparse.Namespace, world: ArmInWorld | None) -> Any:
     if options.no_hand:
         return None
     from .hand import HandServer
 
-    return HandServer(options.host)
+    return HandServer(options.host, world=world)
+
+
+def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | None:
+    """Return the arm's place in the simulated world of the rig; None without a rig. Raises ValueError."""
+    if options.config is None:
+        return None
+    rig = load(options.config, sim=False, overrides=options.set).resolve()
+    arm = next((arm for arm in rig.robots if arm.driver == "franka" and arm.options.get("host") == options.host), None)
+    if arm is None:
+        raise ValueError(
+            f"{options.config} has no Franka at {options.host}: change --host, or --set robots.NAME.real.host"
+        )
+    stack.enter_context(run_world(options.config, options.set))
+    world = ArmInWorld(address_of(arm), arm.name)
+    stack.callback(world.close)
+    return world
 
 
 def _address(text: str) -> str:

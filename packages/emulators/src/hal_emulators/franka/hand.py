@@ -16,6 +16,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from hal_emulators.shared_world import ArmInWorld
+
 from .hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
 from .hand_network import (
     HAND_PORT,
@@ -94,6 +96,8 @@ def number(word: str, least: float = 0.0, most: float = 1e6) -> float:
 
 _STEP = 0.01
 """s between two steps of moving fingers."""
+_WORLD_STEP = 0.004
+"""The same in a simulated world, in all states."""
 _RESTART = "0.5"
 """Duration of a restart, s."""
 
@@ -113,8 +117,20 @@ class HandServer:
         period: float = 0.02,
         homed: bool = True,
         port: int = HAND_PORT,
+        world: ArmInWorld | None = None,
     ) -> None:
-        """``period`` is the time between two states, s; ``homed`` is False for a hand that was just switched on."""
+        """Build it.
+
+        Args:
+            host: Address to listen on.
+            version: Protocol that it speaks.
+            object_width: Width of an object between the fingers, m.
+            period: Time between two states, s.
+            homed: False for a hand that was just switched on.
+            port: Port to listen on.
+            world: The simulated world that its arm is in, whose objects the fingers meet.
+        """
+        self._world = world
         self.period = period
         self.fingers = Fingers(object_width, homed)
         self.faults = HandFaults(version)
@@ -180,6 +196,8 @@ class HandServer:
     # Commands.
 
     def _do_object(self, width: str) -> None:
+        if self._world is not None:
+            raise ValueError("the fingers meet the objects of the simulated world: use rig.world")
         self.fingers.put(None if width == "none" else number(width, 1e-6, FULL_WIDTH))
 
     def _do_grasp_ends_at_width(self, word: str) -> None:
@@ -238,7 +256,9 @@ class HandServer:
             due = [now + 1.0]
             if client is not None:
                 due += [self._next_state, client.due]
-            if self.fingers.motion is not None:
+            if self._world is not None:
+                due.append(self._advanced + _WORLD_STEP)
+            elif self.fingers.motion is not None:
                 due.append(self._advanced + _STEP)
             if not self._network.listening:
                 due.append(self._back_at)
@@ -256,6 +276,9 @@ class HandServer:
         self._network.send_answers(now)
 
     def _advance(self, now: float) -> None:
+        if self._world is not None:
+            self.fingers.meet(self._world.object_width)
+            self._world.fingers = self.fingers.width, self.fingers.pressing
         status = self.fingers.advance(now - self._advanced)
         self._advanced = now
         if status is not None:

@@ -19,6 +19,7 @@ FULL_WIDTH = 0.08
 _SPEED_MAX = 0.1  # m/s of the width: 50 mm/s for each finger
 _OWN_SPEED = 0.1  # m/s, where no speed is given; assumption
 _SPRING = 0.002  # m by which fingers open when a stop removes their force; assumption
+_MOVE_FORCE = 20.0  # N
 _BLOCKED = 100.0  # s until a Move that meets an object is answered, as users report (franka_ros, issue 281)
 
 
@@ -106,6 +107,22 @@ class Fingers:
     def put(self, object_width: float | None) -> None:
         """Put an object of this width, m, between the fingers; None removes it."""
         self.object_width = object_width
+
+    def meet(self, object_width: float | None) -> None:
+        """Take the width, m, at which an object in a simulated world stops the fingers; None for no object.
+
+        The world is a few ms late, so the fingers may be too far.
+        """
+        if object_width is not None and (self._on_object() or self.width < object_width):
+            self.width = object_width
+        self.object_width = object_width
+
+    @property
+    def pressing(self) -> float:
+        """Force on what is between the fingers, N. Assumption: a Move that meets an object presses with 20 N."""
+        if self.motion is None or not self._on_object():
+            return self.force
+        return self.motion.force or _MOVE_FORCE
 
     def advance(self, dt: float) -> HandStatus | None:
         """Advance by ``dt`` s; return the status of a motion that ended."""

@@ -15,6 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from hal_emulators.shared_world import ArmInWorld
+
 from .arm import ArmReply, EmulatedArm, RequestHandler, RobotFiles
 from .faults import InjectedFaults
 from .journal import Counters
@@ -226,6 +228,8 @@ class ArmServer:
         self._hung = False
         self._away_until = 0.0
         self._stopping = False
+        self.world: ArmInWorld | None = None
+        """The simulated world that the arm is in."""
 
     def attach(self, serve: Callable[[int], None]) -> None:
         """Pass descriptors that others registered with :attr:`poller` to ``serve`` once they are ready."""
@@ -239,6 +243,8 @@ class ArmServer:
             if self.session is not None and self.session.connected:
                 self._send_state(self.session, packet)
             self._flush()
+            if self.world is not None:
+                self.world.exchange(DT, self.arm.plant.q)
 
     def stop(self) -> None:
         """End the loop soon. Safe in signal handlers."""

@@ -1,0 +1,94 @@
+"""The emulators' side of the world that they share: what an emulated arm tells it and learns of it, and its program."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+
+from hal.config.loader import load
+from hal.drivers.scene.shared import Connection
+from hal.errors import ConnectionLost
+
+__all__ = ["ArmInWorld", "has_world", "run_world"]
+
+_PERIOD = 0.004
+"""Time between two reports of an arm, s."""
+_AT_REST = 4e-6
+"""Motion of a joint between two reports, rad, below which the arm counts as being at rest."""
+
+
+class ArmInWorld:
+    """An emulated arm in the world that its rig's emulators share.
+
+    Attributes:
+        fingers: Width of its fingers, m, and the force with which they press on what is between them, N. Set by the
+            emulator.
+        object_width: Width at which an object stops the fingers, m; None if nothing is between them.
+    """
+
+    def __init__(self, address: str, name: str) -> None:
+        """Raises ConnectionLost if there is no such world."""
+        self.fingers: tuple[float, float] | None = None
+        self.object_width: float | None = None
+        self._connection: Connection | None = Connection.to(address, role="arm", name=name)
+        self._connection.sock.setblocking(False)
+        self._t = time.monotonic()
+        """Time of the arm, s: it falls behind where the emulator is late, so that no motion in the world is faster."""
+        self._due = self._t
+        self._q: list[float] = []
+
+    def exchange(self, dt: float, q: Sequence[float]) -> None:
+        """Report the joint positions (n,), rad, after a cycle of ``dt`` s, and take what the world says."""
+        if self._connection is None:
+            return
+        self._t += dt
+        if self._t < self._due:
+            return
+        before, self._q = self._q, [float(x) for x in q]
+        if all(abs(a - b) < _AT_REST for a, b in zip(self._q, before, strict=False)):
+            self._t = max(self._t, time.monotonic())
+        self._due = self._t + _PERIOD
+        try:
+            self._connection.send({"t": self._t, "q": self._q, "fingers": self.fingers})
+            told = self._connection.receive_newest()
+        except ConnectionLost:  # the program was killed: nothing is between the fingers any more
+            self.close()
+            return
+        if told is not None:
+            self.object_width = told["object"]
+
+    def close(self) -> None:
+        """Leave the world."""
+        if self._connection is not None:
+            self._connection.close()
+        self._connection, self.object_width = None, None
+
+
+def has_world(config: str, overrides: Sequence[str] = ()) -> bool:
+    """Return whether a rig has a simulated world in which all arms are emulated. Raises ConfigError."""
+    world = load(config, sim=False, overrides=overrides).resolve().world
+    return world is not None and bool(world.robots) and all(robot.emulated for robot in world.robots)
+
+
+@contextlib.contextmanager
+def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
+    """Run the world of a rig in a process of its own, unless another emulator of the rig runs it.
+
+    Raises:
+        ValueError: It does not start; the message has the reason.
+    """
+    words = [word for value in overrides for word in ("--set", value)]
+    command = [sys.executable, "-m", "hal_emulators.world", "--config", config, *words]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            line = process.stdout.readline().strip()
+            if line not in ("ready", "shared"):
+                raise ValueError(line.removeprefix("error: ") or "the program of the world ended")
+            yield
+        finally:
+            process.stdin.close()  # it ends

@@ -1,0 +1,327 @@
+"""The program that steps the world of emulated arms: ``python -m hal_emulators.world --config RIG``.
+
+Emulators start it. Time in the world is that of their arms: each is placed where it was at the time of a step, so a
+busy computer makes the world late, and no motion in it faster. The world's fingers are a little ahead of the emulated
+ones, and press as these do; these stop where the world's meet an object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import math
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hal import registry
+from hal.config.loader import load
+from hal.drivers.scene.gripper import SimulatedGripper
+from hal.drivers.scene.shared import Connection, address_of, scene_of
+from hal.errors import ConnectionLost, HalError
+from hal.host.process import pack_error
+from hal.specs import RobotSpec, WorldSpec
+
+__all__ = ["ArmOfWorld", "WorldServer", "main"]
+
+_LONGEST_GAP = 5.0
+"""Time for which the world catches up, s."""
+_SILENT = 1.0
+"""Time without a report after which the world does not wait for an arm, s."""
+_FASTEST = 20.0
+"""Joint speed, rad/s, from which on an arm counts as placed elsewhere."""
+_FINGER_LEAD = 0.045
+"""Time, s, by which the fingers lead: the emulated ones have to know of an object before they are there."""
+_FINGER_SPEED = 3.0
+"""The world's fingers may be so many times as fast as the emulated ones, so that they can follow."""
+_TOUCHED = 0.02
+"""Time after the last contact until which it counts, s: contacts flicker."""
+_OPPOSITE = -0.5
+"""Greatest cosine between the two sides' normals of contact with an object between them."""
+
+
+class ArmOfWorld:
+    """An emulated arm in the world: where it is, and what its fingers meet."""
+
+    def __init__(self, world: Any, spec: RobotSpec) -> None:
+        self._world = world
+        self.name = spec.name
+        self.object_width: float | None = None
+        """Width of the fingers on what is between them, m; None for nothing."""
+        self._reports: deque[tuple[float, list[float]]] = deque()
+        self.reported = self.heard = -math.inf
+        """Time of the newest report, and when it came, s."""
+        self._q: list[float] | None = None
+        self._width: tuple[float, float] | None = None
+        """Time, s, and width, m, of the newest report of the fingers."""
+        self._speed = self._force = 0.0
+        self._target: tuple[float, float] | None = None
+        self._touched_at = -1.0
+        self._fingers: SimulatedGripper[Any, Any] | None = None
+        self._sides: list[set[str]] = []
+        if spec.gripper is not None and spec.gripper.joints:
+            self._fingers = registry.load(world.spec.driver, "gripper")(spec.gripper, world)
+            self._fingers.open()
+            body = world.body(spec.name)
+            self._sides = [
+                {link for link in body.links if joint in {above.name for above in body.urdf.above(link)}}
+                for joint in spec.gripper.joints
+            ]
+
+    def take(self, report: Mapping[str, Any]) -> None:
+        """Take a report of the emulator."""
+        t, self.heard = report["t"], time.monotonic()
+        self.reported = t
+        self._reports.append((t, report["q"]))
+        if report["fingers"] is not None:
+            width, self._force = report["fingers"]
+            if self._width is not None and t > self._width[0]:
+                self._speed = (width - self._width[1]) / (t - self._width[0])
+            self._width = (t, width)
+
+    def prepare_step(self, t: float, dt: float) -> None:
+        """Place the arm where it is at ``t``, and drive its fingers."""
+        if self._reports:
+            q = self._interpolate(t)
+            before = q if self._q is None else self._q
+            dq = [(new - old) / dt for new, old in zip(q, before, strict=True)]
+            if max(map(abs, dq)) > _FASTEST:
+                before, dq = q, [0.0] * len(q)
+            self._world.follow(self.name, before, dq)
+            self._q = q
+        if self._fingers is not None and self._width is not None:
+            self._drive_fingers()
+
+    def _interpolate(self, t: float) -> list[float]:
+        reports = self._reports
+        while len(reports) > 1 and reports[1][0] <= t:
+            reports.popleft()
+        t0, q0 = reports[0]
+        if len(reports) == 1 or t <= t0:
+            return q0
+        t1, q1 = reports[1]
+        share = (t - t0) / (t1 - t0)
+        return [a + share * (b - a) for a, b in zip(q0, q1, strict=True)]
+
+    def _drive_fingers(self) -> None:
+        """Let the fingers follow those of the emulator, or press as they do."""
+        fingers, width = self._fingers, self._width
+        assert fingers is not None
+        assert width is not None
+        spec = fingers.spec
+        if self._force > 0.0:
+            wanted = (spec.width_min, self._force)
+        else:
+            wanted = (width[1] + self._speed * _FINGER_LEAD, spec.force)
+        if self._target is None or max(abs(a - b) for a, b in zip(wanted, self._target, strict=True)) > 1e-6:
+            self._target = wanted
+            fingers.move(wanted[0], spec.speed, wanted[1])
+
+    def finish_step(self, t: float) -> bool:
+        """Find out what the fingers touch; return whether the emulator has to know."""
+        if self._fingers is None:
+            return False
+        width = self._fingers.read(t).width
+        before = self.object_width
+        if self._is_between():
+            self._touched_at = t
+            self.object_width = width
+        elif t > self._touched_at + _TOUCHED:
+            self.object_width = None
+        now = self.object_width
+        return now != before if now is None or before is None else abs(now - before) > 1e-6
+
+    def _is_between(self) -> bool:
+        """Return whether both fingers touch one thing, from opposite sides."""
+        touched: list[dict[str, list[Any]]] = [{} for _ in self._sides]
+        for contact in self._world.contacts(self.name):
+            for side, links in zip(touched, self._sides, strict=True):
+                if contact["link_a"] in links and contact["b"] != self.name:
+                    side.setdefault(contact["b"], []).append(contact["normal"])
+        one, other = touched[0], touched[-1]
+        return any(
+            float(np.mean(one[thing], axis=0) @ np.mean(other[thing], axis=0)) < _OPPOSITE
+            for thing in one.keys() & other
+        )
+
+
+class WorldServer:
+    """Steps a world in real time, and serves emulators and programs."""
+
+    def __init__(self, spec: WorldSpec) -> None:
+        """Build the world and listen.
+
+        Raises:
+            ConfigError: Something in the record cannot be loaded.
+            OSError: ``EADDRINUSE``: another program has this world.
+        """
+        self._spec = spec
+        self._poller = select.epoll()
+        self._listeners: dict[int, socket.socket] = {}
+        for address in {address_of(robot) for robot in spec.robots if robot.emulated}:
+            listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            listener.bind(address)
+            listener.listen(8)
+            self._listeners[listener.fileno()] = listener
+            self._poller.register(listener, select.EPOLLIN)
+        self._clients: dict[int, Connection] = {}
+        self._roles: dict[int, str] = {}
+        self._arms_of: dict[int, ArmOfWorld] = {}
+        self._build()
+
+    def _build(self) -> None:
+        """Make the world anew; arms keep their reports."""
+        quick = tuple(
+            robot
+            if robot.gripper is None
+            else replace(robot, gripper=replace(robot.gripper, speed=_FINGER_SPEED * robot.gripper.speed))
+            for robot in self._spec.robots
+        )
+        spec = replace(self._spec, robots=quick)
+        self.world: Any = registry.load(spec.driver, "world")(spec)
+        self.arms = {robot.name: ArmOfWorld(self.world, robot) for robot in spec.robots}
+
+    def run(self, until: int) -> None:
+        """Step and serve until the descriptor ``until`` is closed on the other side."""
+        self._poller.register(until, select.EPOLLIN | select.EPOLLHUP)
+        dt = self.world.dt
+        t = self._reported(time.monotonic())
+        """Time of the step that was made last, s."""
+        while True:
+            now = time.monotonic()
+            reported = self._reported(now)
+            t = max(t, reported - _LONGEST_GAP)
+            if t + dt <= reported:
+                t += dt
+                self._step(t, dt)
+            ready = t + dt <= reported
+            for descriptor, _ in self._poller.poll(0.0 if ready else dt):
+                if descriptor == until:
+                    if not os.read(until, 4096):
+                        return
+                elif descriptor in self._listeners:
+                    self._accept(self._listeners[descriptor])
+                else:
+                    self._serve(descriptor)
+
+    def _reported(self, now: float) -> float:
+        """Return the time up to which the arms have reported where they are, s."""
+        times = [arm.reported for arm in self._arms_of.values() if arm.heard > now - _SILENT]
+        return min(times, default=now)
+
+    def _step(self, t: float, dt: float) -> None:
+        for arm in self.arms.values():
+            arm.prepare_step(t, dt)
+        self.world.step()
+        changed = {name for name, arm in self.arms.items() if arm.finish_step(t)}
+        for descriptor, arm in self._arms_of.items():
+            if arm.name in changed:
+                self._send(descriptor, {"object": arm.object_width})
+        watching = [descriptor for descriptor, role in self._roles.items() if role == "poses"]
+        if watching:
+            state = self._state()
+            for descriptor in watching:
+                self._send(descriptor, state)
+
+    def _state(self) -> dict[str, Any]:
+        world = self.world
+        return {"steps": world.steps, "revision": world.revision, "snapshot": world.snapshot()}
+
+    def _send(self, descriptor: int, message: Any) -> None:
+        with contextlib.suppress(ConnectionLost):  # the poller reports its end
+            self._clients[descriptor].send(message)
+
+    def _accept(self, listener: socket.socket) -> None:
+        sock, _ = listener.accept()
+        sock.setblocking(False)
+        self._clients[sock.fileno()] = Connection(sock)
+        self._poller.register(sock, select.EPOLLIN)
+
+    def _serve(self, descriptor: int) -> None:
+        client = self._clients[descriptor]
+        try:
+            while (message := client.receive()) is not None:
+                if descriptor not in self._roles:
+                    self._greet(descriptor, message)
+                elif descriptor in self._arms_of:
+                    self._arms_of[descriptor].take(message)
+                else:
+                    client.send(self._answer(message))
+        except (ConnectionLost, KeyError, TypeError, ValueError):
+            self._poller.unregister(client.sock)
+            del self._clients[descriptor]
+            self._roles.pop(descriptor, None)
+            self._arms_of.pop(descriptor, None)
+            client.close()
+
+    def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer to a request of :class:`.shared.SharedWorld`, with the state after it."""
+        try:
+            result = self.world.request(message["method"], message["params"])
+        except Exception as error:
+            return {"error": pack_error(error)}
+        return {"result": result, "state": self._state()}
+
+    def _greet(self, descriptor: int, message: Mapping[str, Any]) -> None:
+        role = message["role"]
+        if role == "arm":
+            arm = self._arms_of[descriptor] = self.arms[message["name"]]
+            self._send(descriptor, {"object": arm.object_width})
+        elif role == "requests":
+            if self.world.revision:
+                self._restart()
+            self._send(descriptor, {"scene": scene_of(self._spec), "warnings": self.world.warnings})
+        else:
+            self._send(descriptor, self._state())
+        self._roles[descriptor] = role
+
+    def _restart(self) -> None:
+        """Undo what a program that is gone added, removed and painted: the next one does not know of it."""
+        self.world.close()
+        self._build()
+        for descriptor, arm in self._arms_of.items():
+            self._arms_of[descriptor] = self.arms[arm.name]
+            self._send(descriptor, {"object": None})
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program until its standard input ends; return its exit status. Its first line says whether it runs."""
+    parser = argparse.ArgumentParser(
+        prog="python -m hal_emulators.world", description="Steps the world of a rig's emulated arms."
+    )
+    parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends it
+    try:
+        world = load(options.config, sim=False, overrides=options.set).resolve().world
+        if world is None:
+            raise ValueError("this rig has no simulated world: it needs a simulated camera")
+        if not all(robot.emulated for robot in world.robots):
+            raise ValueError("every arm of this rig must be an emulated one")
+        server = WorldServer(world)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            raise
+        print("shared", flush=True)
+        return 0
+    except (HalError, ValueError) as error:
+        print(f"error: {' '.join(str(error).split())}", flush=True)
+        return 1
+    print("ready", flush=True)
+    server.run(sys.stdin.fileno())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
