@@ -1,8 +1,9 @@
 """One simulated world for a rig whose arms are emulated: its emulators and the program that opens it share it.
 
 A program beside the emulators steps the world (``hal_emulators.world``). Each emulator tells it where its arm is and
-how its fingers press, and learns how wide the object between them is. The process of a rig's simulated world shows the same world instead of a copy of its own (:class:`SharedWorld`), so cameras and ``rig.world`` have one truth.
-Messages are JSON, one per packet of a socket in Linux's abstract name space.
+how its fingers press, and learns how wide the object between them is. The process of a rig's simulated world shows the
+same world instead of a copy of its own (:class:`SharedWorld`), so cameras and ``rig.world`` have one truth. Messages
+are JSON, one per packet of a socket in Linux's abstract name space.
 """
 
 from __future__ import annotations
