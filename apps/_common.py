@@ -460,19 +460,19 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
             sys.stdout.flush()  # while what fails can still be reported
         return status
     except HalError as error:
-        return _failed(f"{type(error).__name__}: {error}")
+        return _report_failure(f"{type(error).__name__}: {error}")
     except BrokenPipeError:  # nothing reads the output any more, as behind "| head"
         _discard_output()
         return 1
     except OSError as error:  # a device or a file that cannot be opened, or an output that cannot be written
-        return _failed(f"{type(error).__name__}: {error}")
+        return _report_failure(f"{type(error).__name__}: {error}")
     except KeyboardInterrupt:
         return 130
     finally:
         link.disabled = before
 
 
-def _failed(message: str) -> int:
+def _report_failure(message: str) -> int:
     with suppress(OSError):
         print(message, file=sys.stderr)
     try:

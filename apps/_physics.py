@@ -207,7 +207,7 @@ def period(times: Array, values: Array) -> float:
 # --- joints of objects -----------------------------------------------------------------------------------------------
 
 
-def jointed(folder: str, joint: str, link: str) -> dict[str, Any]:
+def make_jointed(folder: str, joint: str, link: str) -> dict[str, Any]:
     """Write a URDF with one joint between its fixed base and a link; return the object, 1 m above the origin."""
     file = Path(folder) / "it.urdf"
     file.write_text(
@@ -228,7 +228,7 @@ def drawer(engine: str) -> Iterator[Row]:
     pull, friction, damping = 5.0, 2.0, 10.0
     joint = f'type="prismatic"><axis xyz="1 0 0"/><dynamics friction="{friction}" damping="{damping}"/>'
     link = solid(1.0, "0 0 0", (0.01, 0.01, 0.01))
-    with tempfile.TemporaryDirectory() as folder, open_world(engine, jointed(folder, joint, link)) as rig:
+    with tempfile.TemporaryDirectory() as folder, open_world(engine, make_jointed(folder, joint, link)) as rig:
         rig.world.apply_force("it", [pull, 0, 0], link="part", duration=3.0)
         rig.clock.sleep(1.5)
         before = rig.world.joint_positions("it")["joint"]
@@ -242,7 +242,7 @@ def door(engine: str) -> Iterator[Row]:
     push, seconds, damping, width, mass = 10.0, 0.1, 2.0, 0.8, 10.0
     joint = f'type="revolute"><axis xyz="0 0 1"/><dynamics damping="{damping}"/>'
     link = solid(mass, f"{width / 2} 0 0", (mass / 12, mass * (1 + width**2) / 12, mass * width**2 / 12))
-    with tempfile.TemporaryDirectory() as folder, open_world(engine, jointed(folder, joint, link)) as rig:
+    with tempfile.TemporaryDirectory() as folder, open_world(engine, make_jointed(folder, joint, link)) as rig:
         rig.world.apply_force("it", [0, push, 0], [width, 0, 1], link="part", duration=seconds)
         rig.clock.sleep(12.0)
         angle = rig.world.joint_positions("it")["joint"]
@@ -254,7 +254,7 @@ def pendulum(engine: str) -> Iterator[Row]:
     length, mass, moment, angle = 0.5, 1.0, 0.001, 0.3
     joint = 'type="continuous"><axis xyz="0 1 0"/>'
     link = solid(mass, f"0 0 {-length}", (moment,) * 3)
-    with tempfile.TemporaryDirectory() as folder, open_world(engine, jointed(folder, joint, link)) as rig:
+    with tempfile.TemporaryDirectory() as folder, open_world(engine, make_jointed(folder, joint, link)) as rig:
         rig.world.set_joint_positions("it", {"joint": angle})
         times, angles = record(rig, 10.0, lambda: rig.world.joint_positions("it")["joint"])
     small = 2 * math.pi * math.sqrt((moment + mass * length**2) / (mass * G * length))

@@ -45,7 +45,7 @@ def show_cameras() -> bool:
             driver = registry.load(name, "camera")
             if driver.simulated:
                 continue
-            plugged = driver.plugged()
+            plugged = driver.list_plugged()
         except (HalError, OSError) as error:
             print(f"{name:12s} {type(error).__name__}: {error}")
             continue
@@ -163,13 +163,13 @@ class _PadMonitor:
         now = time.monotonic()
         if now >= self._next:
             self._next = now + _SCAN_PERIOD
-            yield from self._plugged()
+            yield from self._list_plugged()
         for name, pad in list(self.open.items()):
             pad.poll_once(now)
             yield from self._news(name, pad)
 
-    def _plugged(self) -> Iterator[str]:
-        found = self._driver.plugged()
+    def _list_plugged(self) -> Iterator[str]:
+        found = self._driver.list_plugged()
         for note in found.notes:
             if note not in self._notes:
                 self._notes.add(note)
@@ -409,7 +409,7 @@ def main(args: argparse.Namespace) -> int:
         found = list(verdicts)
         print(json.dumps({"rig": plan.source, "fit": _fit(found), "verdicts": [asdict(v) for v in found]}, indent=2))
     else:
-        found = _shown(verdicts)
+        found = _print_results(verdicts)
         if not list_real_arms(plan) and not list_checked_cameras(plan):
             print("no device checks for this rig; checked this computer only")
     return 0 if _fit(found) else ACTION_NEEDED
@@ -444,14 +444,14 @@ def may_open(plan: Plan) -> bool:
 
     arms = list_real_arms(plan)
     emulated = all(robot.emulated for robot in arms)  # an emulator does not depend on this computer's timing
-    return not arms or _fit(_shown(preflight(plan, _BRIEF_DURATION, machine=not emulated, cameras=False)))
+    return not arms or _fit(_print_results(preflight(plan, _BRIEF_DURATION, machine=not emulated, cameras=False)))
 
 
 def _fit(verdicts: Sequence[CheckResult]) -> bool:
     return all(verdict.level != "fail" for verdict in verdicts)
 
 
-def _shown(verdicts: Iterable[CheckResult]) -> list[CheckResult]:
+def _print_results(verdicts: Iterable[CheckResult]) -> list[CheckResult]:
     """Print each result as soon as it is known, with its remedy below, which is printed once if several share it."""
     found = []
     remedies = set()

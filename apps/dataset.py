@@ -133,7 +133,7 @@ def main(args: argparse.Namespace) -> int:
         print(f"{count_episodes(len(chosen))} of {dataset.root}: {args.task}")
     elif args.command == "trim":
         _trim(dataset, chosen, args)
-    elif args.yes or _confirmed(f"delete {len(chosen)} of {count_episodes(len(dataset))} of {dataset.root}, for good?"):
+    elif args.yes or _ask(f"delete {len(chosen)} of {count_episodes(len(dataset))} of {dataset.root}, for good?"):
         print(f"{dataset.root}: {count_episodes(delete_episodes(dataset, chosen))} left")
     else:
         print("nothing was deleted")
@@ -178,7 +178,7 @@ def _trim(dataset: Dataset, chosen: list[int], args: argparse.Namespace) -> None
     total = f"{before + after} rows of {count_episodes(len(kept))}"
     if args.dry_run or not kept:
         print(f"{total} would be removed" if kept else "nothing to trim")
-    elif args.out or args.yes or _confirmed(f"remove {total} of {dataset.root}, for good?"):
+    elif args.out or args.yes or _ask(f"remove {total} of {dataset.root}, for good?"):
         trim(dataset, kept, args.out, on_episode=_progress())
         print(f"{args.out or dataset.root}: {total} removed")
     else:
@@ -211,7 +211,7 @@ def _matches(episode: Episode, args: argparse.Namespace) -> bool:
     )
 
 
-def _confirmed(question: str) -> bool:
+def _ask(question: str) -> bool:
     if not sys.stdin.isatty():
         raise CommandError(f"{question} repeat the command with --yes", code="not_confirmed")
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")

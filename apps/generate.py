@@ -120,7 +120,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         plan = resolve_plan(args, *details, cameras=cameras or (), clock="lock_step")
     except ConfigError as error:
-        raise _without_real_devices(error, args) from None
+        raise _explain_real_devices(error, args) from None
     _check_plan(plan)
     if plan.engine is not None:
         registry.check_engine(plan.engine)
@@ -185,7 +185,7 @@ def _check_workers(args: argparse.Namespace) -> dict[str, Any]:
     return found
 
 
-def _without_real_devices(error: ConfigError, args: argparse.Namespace) -> HalError:
+def _explain_real_devices(error: ConfigError, args: argparse.Namespace) -> HalError:
     """Return the error for this program, in which nothing else than a simulation would help against real devices."""
     if {problem.code for problem in error.problems} - {"real_in_lock_step", "emulated_in_lock_step"}:
         return error

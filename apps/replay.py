@@ -85,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
         if not rig.robots:
             raise CommandError(f"{rig.plan.source} has no robot", code="no_robot")
         robot = rig.robots[args.robot or _driven(rig, episode)]
-        print("\n  ".join([banner(rig), what, *_replayed(robot, episode)]) + f"\n{list_links(rig)}", flush=True)
+        print("\n  ".join([banner(rig), what, *_describe_replay(robot, episode)]) + f"\n{list_links(rig)}", flush=True)
         deadman, _, button = find_deadman(rig) if holds else (None, None, "")
         return ReplayRun(rig, robot, episode, args, deadman, button).run()
 
@@ -101,7 +101,7 @@ def _driven(rig: Rig, episode: Episode) -> str:
     return next((name for name in rig.robots if name in recorded), next(iter(rig.robots)))
 
 
-def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
+def _describe_replay(robot: Robot, episode: Episode) -> Iterator[str]:
     """Yield lines for the banner: the arm, other arms that moved in the recording, and damaged images."""
     from hal.learning.replay import list_other_arms
     from hal.recording.layout import GRIP_FORCE
@@ -152,12 +152,12 @@ class ReplayRun:
         except KeyboardInterrupt:
             reason = "Ctrl-C"
         self.line.clear()
-        ticks, missed = self._missed()
+        ticks, missed = self._count_missed()
         self._print_results(reason, ticks, missed)
         write_report(self.args.report, self._report(reason) | {"servo": {"ticks": ticks, "missed": missed}})
         return 0 if self.player.finished else NOT_FINISHED
 
-    def _missed(self) -> tuple[int, int]:
+    def _count_missed(self) -> tuple[int, int]:
         """Return the ticks during the replay and the missed ones; zeros if the arm's process is gone."""
         try:
             now = self._servo()

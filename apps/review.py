@@ -91,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
     if args.episode is None:
         _warn_of_index(dataset, found)
     if args.episode is not None and not found.broken:
-        for path in _drawn(args, dataset.root, episode):
+        for path in _write_picture(args, dataset.root, episode):
             print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
     return ACTION_NEEDED if found.broken else 0
 
@@ -150,7 +150,7 @@ def _warn_of_index(dataset: Dataset, found: DatasetSummary) -> None:
         print(f"warning: the index is damaged: {wrong}; rebuild it with: {repair_command(layout)}", file=sys.stderr)
 
 
-def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[Path]:
+def _write_picture(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[Path]:
     """Write the picture or the .rrd file of an episode; yield its path."""
     from hal.recording.exporters.output import write_atomically
 

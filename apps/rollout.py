@@ -447,7 +447,7 @@ class RolloutRun:
         if self.reset_function is not None:
             self.reset_function(rig, random)
         elif put:
-            self._announce(f"episode {number}: {', '.join(_placed(name, pose) for name, pose in put.items())}")
+            self._announce(f"episode {number}: {', '.join(_describe_place(name, pose) for name, pose in put.items())}")
         if self.button:
             words = {True: "success", False: "failure"}
             names = self.pad.control_name if self.pad is not None else str
@@ -515,7 +515,7 @@ class RolloutRun:
         }
 
 
-def _placed(name: str, pose: Pose) -> str:
+def _describe_place(name: str, pose: Pose) -> str:
     x, y, z = pose.position
     return f"{name} at x {x:.3f}, y {y:.3f}, z {z:.3f} m"
 

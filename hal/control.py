@@ -261,10 +261,10 @@ class Control:
         Raises:
             CommandError: No such gain, or a wrong value for this arm (``code`` is ``bad_controller``).
         """
-        from .servo.controllers import with_gains
+        from .servo.controllers import replace_gains
 
         self._require_open()
-        before, self.controller = self.controller, self._resolve_controller(with_gains(self.controller, gains))
+        before, self.controller = self.controller, self._resolve_controller(replace_gains(self.controller, gains))
         law = self._describe_controller()
         try:
             self._host.request("gains", {"robot": self.robot.name, "session": self._id, "controller": law})

@@ -465,7 +465,7 @@ class CameraDriver(DeviceDriver):
         self.spec, self.source = spec, source
 
     @classmethod
-    def plugged(cls) -> tuple[str, ...]:
+    def list_plugged(cls) -> tuple[str, ...]:
         """Describe the cameras that could be opened now, each with what identifies it. Opens nothing."""
         return ()
 
@@ -561,7 +561,7 @@ class GamepadDriver(DeviceDriver):
         """Axes that stay where they are put (a lever), and need not be at rest before the pad counts."""
 
     @classmethod
-    def plugged(cls) -> Plugged:
+    def list_plugged(cls) -> Plugged:
         """Return the pads that could be opened now. Quick; opens nothing; a missing pad is no error."""
         return Plugged(())
 

@@ -429,7 +429,7 @@ class Rig:
         for shown in (self._pictures, self._viewer, self.viewer3d):
             if shown is not None:
                 with contextlib.suppress(ConnectionLost):  # its own next use raises the error
-                    shown.edited(method, params, revision)
+                    shown.note_edit(method, params, revision)
         if method == "randomize" and self._pictures is not None:
             for name in self._pictures.cameras:
                 self._devices[name].vary(params["values"])

@@ -272,7 +272,7 @@ class WorldView(ABC):
         """Wait until it displays the world; raise the error that it met while starting."""
 
     @abstractmethod
-    def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+    def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Repeat an edit of the world before a snapshot of that revision is displayed.
 
         Args:

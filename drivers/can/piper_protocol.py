@@ -153,7 +153,7 @@ class GripperRequest(NamedTuple):
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
         code = int(self.enabled) | int(self.clear_error) << 1
-        return _GRIPPER, _packed(">iHBB", self.width * 1e6, self.torque * 1e3, code, _SET if self.set_zero else 0)
+        return _GRIPPER, _pack(">iHBB", self.width * 1e6, self.torque * 1e3, code, _SET if self.set_zero else 0)
 
 
 class EnableRequest(NamedTuple):
@@ -322,7 +322,7 @@ class GripperStatus(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
-        return _GRIPPER_STATUS, _packed(">ihBx", self.width * 1e6, self.torque * 1e3, self.flags)
+        return _GRIPPER_STATUS, _pack(">ihBx", self.width * 1e6, self.torque * 1e3, self.flags)
 
 
 class JointMotion(NamedTuple):
@@ -339,7 +339,7 @@ class JointMotion(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
-        return _MOTION + self.joint, _packed(">hhi", *(value * 1e3 for value in self[1:]))
+        return _MOTION + self.joint, _pack(">hhi", *(value * 1e3 for value in self[1:]))
 
 
 class JointStatus(NamedTuple):
@@ -361,7 +361,7 @@ class JointStatus(NamedTuple):
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
         _, voltage, driver, motor, flags, current = self
-        data = _packed(">HhbBH", voltage * 10, driver, motor, flags, current * 1e3)
+        data = _pack(">HhbBH", voltage * 10, driver, motor, flags, current * 1e3)
         return _MOTOR_STATUS + self.joint, data
 
 
@@ -380,7 +380,7 @@ class JointLimits(NamedTuple):
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
         tenths = _MILLIDEGREES * 1e-2
-        return _LIMITS, _packed(">BhhHx", self.motor, self.upper * tenths, self.lower * tenths, self.velocity * 1e3)
+        return _LIMITS, _pack(">BhhHx", self.motor, self.upper * tenths, self.lower * tenths, self.velocity * 1e3)
 
 
 class AccelerationLimit(NamedTuple):
@@ -393,7 +393,7 @@ class AccelerationLimit(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
-        return _ACCELERATION, _packed(">BH5x", self.motor, self.acceleration * 1e3)
+        return _ACCELERATION, _pack(">BH5x", self.motor, self.acceleration * 1e3)
 
 
 class Acknowledgement(NamedTuple):
@@ -527,7 +527,7 @@ _POSE_SCALES = {0: (1e6, 1e6), 2: (1e6, _MILLIDEGREES), 4: (_MILLIDEGREES, _MILL
 def _pair(values: Sequence[float], scale: float, second: float | None = None) -> bytes:
     """Return two numbers as integers of 32 bits, after multiplication by ``scale`` (and ``second``)."""
     a, b = values
-    return _packed(">ii", a * scale, b * (scale if second is None else second))
+    return _pack(">ii", a * scale, b * (scale if second is None else second))
 
 
 def _radians(data: bytes) -> tuple[float, float]:
@@ -535,7 +535,7 @@ def _radians(data: bytes) -> tuple[float, float]:
     return a / _MILLIDEGREES, b / _MILLIDEGREES
 
 
-def _packed(layout: str, *numbers: float) -> bytes:
+def _pack(layout: str, *numbers: float) -> bytes:
     """Return the rounded numbers in a frame's layout. Raises ValueError for one that is not finite or does not fit."""
     try:
         return struct.pack(layout, *map(round, numbers))

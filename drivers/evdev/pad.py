@@ -62,7 +62,7 @@ class EvdevPad(GamepadDriver):
         self._last = PadReading(-math.inf, -math.inf, 0.0, 0, _RELEASED, frozenset(), connected=False)
 
     @classmethod
-    def plugged(cls) -> Plugged:
+    def list_plugged(cls) -> Plugged:
         if sys.platform != "linux":
             return Plugged(())
         nodes = LinuxInput().nodes()
@@ -158,7 +158,7 @@ class EvdevPad(GamepadDriver):
 
     def _find_pad(self, finder: DeviceFinder, nodes: list[NodeInfo]) -> None:
         pads = [info for info in nodes if info.is_pad or info.is_joystick]
-        wanted = [info for info in pads if self._wanted(info)]
+        wanted = [info for info in pads if self._is_wanted(info)]
         others = ", ".join(info.describe() for info in pads if info.is_pad)
         self.notes = (f"not the pad that the rig names: {others}",) if others and not wanted else ()
         for info in wanted:
@@ -166,7 +166,7 @@ class EvdevPad(GamepadDriver):
             if self._link is not None:
                 return
 
-    def _wanted(self, info: NodeInfo) -> bool:
+    def _is_wanted(self, info: NodeInfo) -> bool:
         options = self._options
         if options.device is not None or options.name is not None:
             by_name = options.name is None or options.name.lower() in info.identity.name.lower()

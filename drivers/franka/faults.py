@@ -276,7 +276,7 @@ def fault_of_exception(
             known = NO_HAND
         return known.fault("the robot" if host is None else f"{host}:{port}")
     message = " ".join(text.split()).removeprefix("libfranka: ") or type(error).__name__
-    return Fault("libfranka", _shortened(message), "look at Desk, and run hal check")
+    return Fault("libfranka", _shorten(message), "look at Desk, and run hal check")
 
 
 def is_connection_lost(error: BaseException) -> bool:
@@ -342,7 +342,7 @@ def _code(name: str) -> str:
     return name if len(name) <= _CODE else name.replace("motion_generator", "mg").removesuffix("_violation")[:_CODE]
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text.encode()) <= _CAUSE else text.encode()[: _CAUSE - 3].decode(errors="ignore") + "..."
 
 

@@ -82,12 +82,12 @@ def _check(spec: RobotSpec, settings: ArmSettings, duration: float) -> Iterator[
     host = settings.host
     address = resolve_host(host)
     if address is None:
-        yield _failed("address", UNKNOWN_HOST.fault(host))
+        yield _report_failure("address", UNKNOWN_HOST.fault(host))
         return
     yield _check_route(host, address)
     port = probe_port(address, ARM_PORT)
     if port is not PortState.OPEN:
-        result = _failed("robot", _PORT_ERRORS[port].fault(f"{host}:{ARM_PORT}"))
+        result = _report_failure("robot", _PORT_ERRORS[port].fault(f"{host}:{ARM_PORT}"))
         yield replace(result, remedy=_START_EMULATOR.format(host=host)) if spec.emulated else result
         return
     yield from _check_robot(spec, settings)
@@ -98,7 +98,7 @@ def _check(spec: RobotSpec, settings: ArmSettings, duration: float) -> Iterator[
         yield CheckResult("network", "unknown", f"not measured: {error}", _ALLOW_PING)
 
 
-def _failed(name: str, fault: Fault) -> CheckResult:
+def _report_failure(name: str, fault: Fault) -> CheckResult:
     return CheckResult(name, "fail", fault.cause, fault.remedy)
 
 
@@ -137,7 +137,7 @@ def _check_robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[CheckResult
             found = f"{host}:{ARM_PORT} closes the connection: another program may hold the arm{describe_load()}"
             yield CheckResult("robot", "fail", found, _IN_USE)
         else:
-            yield _failed("robot", fault)
+            yield _report_failure("robot", fault)
     else:
         found = f"answers; speaks protocol {report['protocol']}, as the model {spec.model!r} requires"
         yield CheckResult("robot", "ok", found)
@@ -176,7 +176,7 @@ def _check_hand(spec: RobotSpec) -> Iterator[CheckResult]:
     if address is not None and probe_port(address, HAND_PORT) is PortState.OPEN:
         yield CheckResult("hand", "ok", f"answers at port {HAND_PORT}")
     else:
-        yield _failed("hand", NO_HAND.fault(f"{host}:{HAND_PORT}"))
+        yield _report_failure("hand", NO_HAND.fault(f"{host}:{HAND_PORT}"))
 
 
 def rate_round_trips(trips: RoundTrips) -> CheckResult:

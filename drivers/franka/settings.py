@@ -46,7 +46,7 @@ def _host(value: Any) -> str:
     return text
 
 
-def _each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
+def _check_each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
     """Check for as many numbers as there are ranges (lowest, highest), each within its own."""
 
     def check(value: Any) -> tuple[float, ...]:
@@ -65,11 +65,11 @@ def _each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
 _ANY = 1e4
 """Largest threshold, Nm or N. One beyond every force of the arm switches the detection off."""
 Host = Annotated[str, BeforeValidator(_host)]
-Torques = Annotated[Floats, _each("Nm, one for each joint", *[(0.0, _ANY)] * 7)]
-Forces = Annotated[Floats, _each("x, y, z in N, then roll, pitch, yaw in Nm", *[(0.0, _ANY)] * 6)]
-JointStiffness = Annotated[Floats, _each("Nm/rad, one for each joint", *[(0.0, 14250.0)] * 7)]
+Torques = Annotated[Floats, _check_each("Nm, one for each joint", *[(0.0, _ANY)] * 7)]
+Forces = Annotated[Floats, _check_each("x, y, z in N, then roll, pitch, yaw in Nm", *[(0.0, _ANY)] * 6)]
+JointStiffness = Annotated[Floats, _check_each("Nm/rad, one for each joint", *[(0.0, 14250.0)] * 7)]
 CartesianStiffness = Annotated[
-    Floats, _each("x, y, z in N/m, then roll, pitch, yaw in Nm/rad", *[(10.0, 3000.0)] * 3, *[(1.0, 300.0)] * 3)
+    Floats, _check_each("x, y, z in N/m, then roll, pitch, yaw in Nm/rad", *[(10.0, 3000.0)] * 3, *[(1.0, 300.0)] * 3)
 ]
 
 
@@ -114,7 +114,7 @@ class CollisionBehavior(Strict):
     upper_force: Forces = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
 
     @model_validator(mode="after")
-    def _ordered(self) -> CollisionBehavior:
+    def _check_order(self) -> CollisionBehavior:
         for kind in ("torque", "force"):
             lower, upper = getattr(self, f"lower_{kind}"), getattr(self, f"upper_{kind}")
             for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
@@ -135,9 +135,9 @@ class LoadSetting(Strict):
     """Mass, kg; the data sheets of both arms give a payload of 3 kg."""
     com: Offset = (0.0, 0.0, 0.0)
     """Centre of mass in the frame of the flange, m."""
-    inertia: Annotated[Floats, _each("xx, yy, zz, xy, xz, yz in kg m2", *[(0.0, 10.0)] * 3, *[(-10.0, 10.0)] * 3)] = (
-        0.0,
-    ) * 6
+    inertia: Annotated[
+        Floats, _check_each("xx, yy, zz, xy, xz, yz in kg m2", *[(0.0, 10.0)] * 3, *[(-10.0, 10.0)] * 3)
+    ] = (0.0,) * 6
     """Moments and products about the centre of mass, kg m2."""
 
     @model_validator(mode="after")

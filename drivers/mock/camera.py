@@ -15,7 +15,7 @@ from hal.errors import CommandError, ConnectionLost
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
-from .faults import MockCameraFaults, with_faults
+from .faults import MockCameraFaults, change_faults
 
 __all__ = ["PLANE", "SQUARE", "STEP", "MockCamera", "PictureStamp", "read_picture"]
 
@@ -166,7 +166,7 @@ class MockCamera(CameraDriver):
             CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
                 (``bad_fault_value``); nothing changes.
         """
-        self.faults = with_faults(self.faults, faults)
+        self.faults = change_faults(self.faults, faults)
 
     def clear(self) -> None:
         """Remove every fault."""

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from hal.errors import CommandError
 
-__all__ = ["FIELDS", "MockCameraFaults", "MockGripperFaults", "MockPadFaults", "MockRobotFaults", "with_faults"]
+__all__ = ["FIELDS", "MockCameraFaults", "MockGripperFaults", "MockPadFaults", "MockRobotFaults", "change_faults"]
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ _GARBAGE = {
 _F = TypeVar("_F", MockRobotFaults, MockGripperFaults, MockCameraFaults, MockPadFaults)
 
 
-def with_faults(present: _F, changes: Mapping[str, object]) -> _F:
+def change_faults(present: _F, changes: Mapping[str, object]) -> _F:
     """Return ``present`` with ``changes`` made.
 
     Raises:
@@ -106,13 +106,13 @@ def with_faults(present: _F, changes: Mapping[str, object]) -> _F:
             close = get_close_matches(name, known, n=1)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
             raise CommandError(f"unknown fault {name!r}{hint}; faults: {', '.join(known)}", code="unknown_fault")
-        expected = _expected(name, value, _GARBAGE.get(type(present), ()))
+        expected = _describe_expected(name, value, _GARBAGE.get(type(present), ()))
         if expected is not None:
             raise CommandError(f"{name} must be {expected}, not {value!r}", code="bad_fault_value")
     return replace(present, **changes)  # type: ignore[arg-type]
 
 
-def _expected(name: str, value: object, garbage: Sequence[str]) -> str | None:
+def _describe_expected(name: str, value: object, garbage: Sequence[str]) -> str | None:
     """Return what the fault's value must be; None where ``value`` is right."""
     if name == "garbage" and value is not None and value not in garbage:
         return f"one of {', '.join(garbage)} or None"

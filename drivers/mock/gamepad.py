@@ -12,7 +12,7 @@ from hal.errors import CommandError
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS, ONE_SIDED
 
-from .faults import MockPadFaults, with_faults
+from .faults import MockPadFaults, change_faults
 
 __all__ = ["MockPad"]
 
@@ -144,7 +144,7 @@ class MockPad(GamepadDriver):
             CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
                 (``bad_fault_value``); nothing changes.
         """
-        self.faults = with_faults(self.faults, faults)
+        self.faults = change_faults(self.faults, faults)
         self._news.set()
 
     def clear(self) -> None:

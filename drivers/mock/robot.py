@@ -16,7 +16,7 @@ from hal.errors import CommandError, ConnectionLost, Fault
 from hal.specs import GripperSpec, RobotSpec
 from hal.types import GripperOutcome
 
-from .faults import MockGripperFaults, MockRobotFaults, with_faults
+from .faults import MockGripperFaults, MockRobotFaults, change_faults
 
 __all__ = ["FRICTION", "INERTIA", "KEEP_UP", "LOG_LENGTH", "MockGripper", "MockRobot"]
 
@@ -173,7 +173,7 @@ class MockRobot(RobotDriver):
                     raise CommandError(
                         f"{name} must have {sizes[name]} numbers, not {len(numbers)}", code="bad_fault_value"
                     )
-        new = with_faults(self.faults, faults)
+        new = change_faults(self.faults, faults)
         if "drop" in faults:
             self._written = 0
         if (new.fault is not None and self.faults.fault is None) or (new.disconnect and not self.faults.disconnect):
@@ -315,7 +315,7 @@ class MockGripper(GripperDriver):
             CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
                 (``bad_fault_value``); nothing changes.
         """
-        self.faults = with_faults(self.faults, faults)
+        self.faults = change_faults(self.faults, faults)
 
     def clear(self) -> None:
         """Remove every fault, and the object."""

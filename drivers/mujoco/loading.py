@@ -281,11 +281,11 @@ def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: flo
     if scale != 1.0:
         for made in links:
             if made.joint is not None:
-                made.joint = _scaled(made.joint, scale)
+                made.joint = _scale_joint(made.joint, scale)
     return plan
 
 
-def _scaled(joint: UrdfJoint, scale: float) -> UrdfJoint:
+def _scale_joint(joint: UrdfJoint, scale: float) -> UrdfJoint:
     return replace(joint, origin=Pose(joint.origin.position * scale, joint.origin.orientation))
 
 

@@ -194,7 +194,7 @@ class MujocoWorld(SimulatedWorld[Body]):
             for body in added:
                 del self.bodies[body.name]
                 take_out(self._spec, self._plans.pop(body.name))
-            raise ConfigError(named or problems or [_refused(str(error))]) from None
+            raise ConfigError(named or problems or [_report_refusal(str(error))]) from None
         new = {body.name for body in added}
         self._adopt(model, [body for body in self.bodies.values() if body.name not in new])
 
@@ -524,7 +524,7 @@ def _find(body: Body, model: Any) -> None:
     body.couplings = couplings
 
 
-def _refused(reason: str) -> Problem:
+def _report_refusal(reason: str) -> Problem:
     return Problem("world", "world", f"MuJoCo: {' '.join(reason.removeprefix('Error: ').split())}", "bad_urdf")
 
 

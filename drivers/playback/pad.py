@@ -113,18 +113,18 @@ class PlaybackPad(GamepadDriver):
         if self._t0 is None:
             self._t0 = self._t_event = now
             self._lead = self._world() - now if self._world is not None else 0.0
-        played = self._played_by(now)
+        played = self._find_played_time(now)
         if timeout > 0.0:
             begun = time.monotonic()
             wait = timeout if self._frozen(played) else min(timeout, self._time_to_next(played))
             if wait > 0.0:
                 time.sleep(wait)
             now += time.monotonic() - begun
-            played = self._played_by(now)
+            played = self._find_played_time(now)
         if self._frozen(played) and self._last is not None:
             return self._last
         self._feed_due_events(mapper, played)
-        connected = self._connected(played)
+        connected = self._is_connected(played)
         last_alive = self._last.t_alive if self._last is not None else -math.inf
         self._last = PadReading(
             t=self._t_event,
@@ -137,7 +137,7 @@ class PlaybackPad(GamepadDriver):
         )
         return self._last
 
-    def _played_by(self, now: float) -> float:
+    def _find_played_time(self, now: float) -> float:
         """Return the time up to which the recording is due: the clock's, less the delay of the world, s."""
         if self._world is not None:
             self._behind = max(self._behind, now + self._lead - self._world())
@@ -173,7 +173,7 @@ class PlaybackPad(GamepadDriver):
         at = self._options.freeze_at
         return at is not None and self._t0 is not None and played - self._t0 >= at
 
-    def _connected(self, played: float) -> bool:
+    def _is_connected(self, played: float) -> bool:
         off, on = self._options.disconnect_at, self._options.reconnect_at
         if off is None or self._t0 is None or played - self._t0 < off:
             return True

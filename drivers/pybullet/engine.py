@@ -25,7 +25,7 @@ __all__ = [
     "Gear",
     "PyBulletClient",
     "load_pybullet",
-    "silenced",
+    "silence_output",
 ]
 
 GEAR_SHARE = 0.8
@@ -46,7 +46,7 @@ class CapturedOutput:
 
 
 @contextmanager
-def silenced() -> Iterator[CapturedOutput]:
+def silence_output() -> Iterator[CapturedOutput]:
     """Capture what C code prints, for example PyBullet's import line and its URDF warnings.
 
     The file descriptors of the whole process are redirected: keep the block short.
@@ -86,7 +86,7 @@ def load_pybullet() -> Any:
     if "pybullet" in sys.modules:
         return sys.modules["pybullet"]
     try:
-        with silenced():
+        with silence_output():
             import pybullet
     except ImportError as error:
         raise DriverMissing(
@@ -110,7 +110,7 @@ class PyBulletClient:
 
     def __init__(self, *, gui: bool = False) -> None:
         self._module = load_pybullet()
-        with silenced():
+        with silence_output():
             self.id: int = self._module.connect(self._module.GUI if gui else self._module.DIRECT)
         if self.id < 0:
             raise DriverMissing("PyBullet could not open its window; is there a display (see the DISPLAY variable)?")

@@ -25,7 +25,7 @@ from hal.kinematics.mesh_files import mesh_file, mesh_near
 from hal.kinematics.urdf import UrdfMimic, UrdfModel, UrdfVisual, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
-from .engine import Body, Gear, PyBulletClient, silenced
+from .engine import Body, Gear, PyBulletClient, silence_output
 from .motors import PassiveJoints
 
 __all__ = [
@@ -177,7 +177,7 @@ def _tighten(link: ElementTree.Element, shapes: Sequence[UrdfVisual], place: Pat
 
 def _write_hull(hull: Hull, file: Path) -> None:
     """Write an OBJ file of a hull that is smaller by PyBullet's margin."""
-    smaller = without_margin(hull)
+    smaller = remove_margin(hull)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in smaller.points]
     file.write_text("".join(lines + [f"f {a} {b} {c}\n" for a, b, c in smaller.faces + 1]))
 
@@ -193,7 +193,7 @@ def _load_urdf(
     tight: Mapping[str, Sequence[UrdfVisual]] | None = None,
 ) -> int:
     number = -1
-    with loadable_urdf(path, tight) as file, silenced() as captured:
+    with loadable_urdf(path, tight) as file, silence_output() as captured:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
             if not drawn:
@@ -277,7 +277,7 @@ def _rpy(axes: NDArray[np.float64]) -> tuple[float, float, float]:
     return roll, math.atan2(-axes[2, 0], math.hypot(axes[2, 1], axes[2, 2])), yaw
 
 
-def without_margin(hull: Hull) -> Hull:
+def remove_margin(hull: Hull) -> Hull:
     """Return a hull that is smaller by the margin that PyBullet adds around hulls; one that is thin keeps some.
 
     It is where all faces, moved inwards by the margin, leave room. Seen from a point inside, a plane at the distance d

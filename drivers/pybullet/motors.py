@@ -275,11 +275,11 @@ class JointTorques:
             max(-effort, min(effort, own + held))
             for own, held, effort in zip(np.add(tau, self._handover), self._gravity, self._efforts, strict=True)
         ]
-        total = wanted if self._damping is None else self._damped(wanted, self._damping)
+        total = wanted if self._damping is None else self._add_damping(wanted, self._damping)
         self._add([new - old for new, old in zip(total, self._sum, strict=True)])
         self._applied = wanted
 
-    def _damped(self, torques: Floats, damping: Array) -> list[float]:
+    def _add_damping(self, torques: Floats, damping: Array) -> list[float]:
         """Return the torques of the motors with those of the damping (n,), Nm."""
         dt = self._dt
         free = self._mass @ self._v0 + dt * (np.array(torques) - self._bias + self._external)

@@ -10,7 +10,7 @@ from hal.drivers.scene.shapes import RenderScene, Visual
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import CameraSpec
 
-from .engine import PyBulletClient, silenced
+from .engine import PyBulletClient, silence_output
 
 __all__ = ["TinyRenderer"]
 
@@ -93,7 +93,7 @@ class TinyRenderer(Renderer):
             "cylinder": lambda: {"shapeType": client.GEOM_CYLINDER, "radius": size[0], "length": size[1]},
             "capsule": lambda: {"shapeType": client.GEOM_CAPSULE, "radius": size[0], "length": size[1]},
         }
-        with silenced():
+        with silence_output():
             shape = client.createVisualShape(
                 **kinds[visual.kind](),
                 rgbaColor=visual.rgba,

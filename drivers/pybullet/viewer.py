@@ -56,7 +56,7 @@ class PyBulletViewer(Viewer):
         if isinstance(host, RemoteHost):
             snapshots, offset = host.shared, host.snapshot_offset
         elif isinstance(host, LocalHost):
-            snapshots, offset = self._published(host), 0
+            snapshots, offset = self._publish_world(host), 0
         else:
             raise NotSupported(f"no window onto a {type(host).__name__}")
         config = {
@@ -66,7 +66,7 @@ class PyBulletViewer(Viewer):
         }
         self._child = Child("viewer", "hal.drivers.pybullet.viewer:main", config, [snapshots])
 
-    def _published(self, host: LocalHost) -> SharedMemory:
+    def _publish_world(self, host: LocalHost) -> SharedMemory:
         """Publish the world from this process in lock-step, each time that simulated time advances."""
         memory = SharedMemory(SeriesBox.size(SNAPSHOT_CAPACITY))
         box = SeriesBox(memory.buffer, SNAPSHOT_CAPACITY)
@@ -87,7 +87,7 @@ class PyBulletViewer(Viewer):
             text = f"the window cannot open on display {os.environ['DISPLAY']}; or use --viewer none ({error})"
             raise NotSupported(text, code="no_display") from error
 
-    def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+    def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         with suppress(ConnectionLost):  # the window may have been closed
             self._child.notify("edited", {"method": method, "params": params, "revision": revision})
 
@@ -120,7 +120,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
             return None  # the window was closed
         return max(0.0, due - time.monotonic())
 
-    serve(channel, {"edited": mirror.edited}, show)
+    serve(channel, {"edited": mirror.note_edit}, show)
 
 
 def _arrange(world: PyBulletWorld) -> None:

@@ -83,7 +83,7 @@ class RealSenseCamera(CameraDriver):
         """Why no frame will ever come again; None while some may."""
 
     @classmethod
-    def plugged(cls) -> tuple[str, ...]:
+    def list_plugged(cls) -> tuple[str, ...]:
         """Return the connected cameras, each with title, serial number and USB link. Takes half a second."""
         child = Child("list of cameras", "hal.drivers.realsense.process:list_plugged", {})
         try:

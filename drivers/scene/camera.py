@@ -207,7 +207,7 @@ class SimulatedPictures(CameraRenderer):
         assert self._renderer is not None
         return DirectSource(self._mirror, self._renderer, spec, self.host.now)
 
-    def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+    def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         if self._child is not None:  # in lock-step the world itself reports its edits
             self._child.notify("edited", {"method": method, "params": params, "revision": revision})
 
@@ -313,7 +313,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
         time.sleep(min(_IDLE * 5, max(0.0, worker.run_once() - time.monotonic())))
         return 0.0
 
-    serve(channel, {"edited": mirror.edited}, draw)
+    serve(channel, {"edited": mirror.note_edit}, draw)
 
 
 # --- renderers -------------------------------------------------------------------------------------------------------

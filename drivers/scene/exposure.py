@@ -131,12 +131,13 @@ class Exposure:
             self._prepare(world.randomized)
             self._frames_before = number - 1 if world.randomized.values else 0
         here = camera_pose(world, self.spec)
-        view = _moved(here, self._T_color)
+        view = _move_pose(here, self._T_color)
         images = RenderedImages(None, None, None, None)
         if self._main is not None:
             images = renderer.render(self._main.spec, view)
         sides = {
-            name: renderer.render(shot.spec, _moved(here, shot.T_color)).infrared for name, shot in self._sides.items()
+            name: renderer.render(shot.spec, _move_pose(here, shot.T_color)).infrared
+            for name, shot in self._sides.items()
         }
         depth, count = images.depth, number - self._frames_before
         if self._noise is not None and depth is not None:
@@ -214,7 +215,7 @@ def _normal_numbers(size: int) -> Image:
     return np.random.default_rng(size).standard_normal(size + _STARTS, np.float32)
 
 
-def _moved(pose: Pose, by: Pose) -> Pose:
+def _move_pose(pose: Pose, by: Pose) -> Pose:
     return pose @ by if by != Pose() else pose
 
 
@@ -462,14 +463,14 @@ class _SmoothNoise:
         if self._patch <= 1.0:
             return generator.standard_normal(self._shape, np.float32)
         start = generator.random(2)
-        rows = self._between(self._shape[0], start[0])
-        columns = self._between(self._shape[1], start[1])
+        rows = self._find_neighbours(self._shape[0], start[0])
+        columns = self._find_neighbours(self._shape[1], start[1])
         grid = generator.standard_normal((rows[0][-1] + 2, columns[0][-1] + 2), np.float32)
         coarse = grid[rows[0]] * rows[1][:, None] + grid[rows[0] + 1] * rows[2][:, None]
         fine: Image = coarse[:, columns[0]] * columns[1] + coarse[:, columns[0] + 1] * columns[2]
         return fine
 
-    def _between(self, count: int, start: float) -> tuple[NDArray[np.int64], Any, Any]:
+    def _find_neighbours(self, count: int, start: float) -> tuple[NDArray[np.int64], Any, Any]:
         """Return, for each pixel, the grid point before it, and its weight and the next one's, for a deviation of 1."""
         at = np.arange(count) / self._patch + start
         before = np.floor(at)

@@ -207,7 +207,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         width, speed, force, load = self._measure()
         if not math.isfinite(width + speed + force + load):  # the simulation is unstable, which its arms report
             width, speed, force, load = self._stood, 0.0, 0.0, 0.0
-        moving = not self._at_rest(width, speed)
+        moving = not self._is_at_rest(width, speed)
         pressing = force >= PRESSING * self._force
         idle = not moving and abs(width - self._target) <= AT_TARGET and load < PRESSING * self._force
         self._engage(not idle)
@@ -260,7 +260,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._driven = speed
         self.drive_fingers(speed)
 
-    def _at_rest(self, width: float, speed: float) -> bool:
+    def _is_at_rest(self, width: float, speed: float) -> bool:
         """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""
         step, dt = self.scene.steps, self.scene.dt
         unseen, self._seen = (step - self._seen) * dt, step
@@ -279,7 +279,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         """Stop the fingers where they are; on an object, they continue to press."""
         self._expect_open()
         width, speed, force, _ = self._measure()
-        if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
+        if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._is_at_rest(width, speed)):
             return
         self._target = width
         self._engage(True)

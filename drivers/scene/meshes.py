@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from .shapes import Mesh, joined, unit
 
-__all__ = ["MeshLibrary", "cache_folder", "coarsened", "parse", "simplified"]
+__all__ = ["MeshLibrary", "cache_folder", "coarsen_mesh", "parse", "simplify_mesh"]
 
 _FORMAT = 8
 """Version of the cache files; increase it whenever the records or the parsing change."""
@@ -171,13 +171,13 @@ def parse(path: str) -> list[Mesh]:
     if not meshes:
         raise ValueError("no triangles")
     whole = [joined(group) for group in meshes.values()]
-    return [_with_levels(mesh) for mesh in whole]
+    return [_add_levels(mesh) for mesh in whole]
 
 
-def _with_levels(whole: Mesh) -> Mesh:
+def _add_levels(whole: Mesh) -> Mesh:
     """Return a mesh for large pictures, with a coarse one for small pictures where that saves much."""
     fine, coarse = (
-        _welded(whole if mesh is whole else _shaded(mesh)) for mesh in (simplified(whole), coarsened(whole))
+        _weld(whole if mesh is whole else _add_normals(mesh)) for mesh in (simplify_mesh(whole), coarsen_mesh(whole))
     )
     return replace(fine, coarse=coarse) if len(coarse.faces) < _COARSE_SAVES * len(fine.faces) else fine
 
@@ -208,19 +208,19 @@ def _part(part: Any) -> Mesh:
         mesh = replace(mesh, colors=np.asarray(visual.vertex_colors, np.uint8))
     elif image is not None and uv is not None:
         texture = np.asarray(image.convert("RGB"), np.uint8)
-        mesh = _painted(replace(mesh, uv=np.asarray(uv, np.float32), texture=texture, material=False))
+        mesh = _paint_vertices(replace(mesh, uv=np.asarray(uv, np.float32), texture=texture, material=False))
     elif material is not None:
         colors[:] = np.asarray(material.main_color, np.uint8)
-    return _shaded(mesh) if not len(normals) or _faceted(mesh) else mesh
+    return _add_normals(mesh) if not len(normals) or _is_faceted(mesh) else mesh
 
 
-def _faceted(mesh: Mesh) -> bool:
+def _is_faceted(mesh: Mesh) -> bool:
     """Return whether each triangle has its own normal: three vertices per triangle, and a faceted look."""
     normals = mesh.normals[mesh.faces]
     return bool(np.mean(np.ptp(normals, axis=1).max(axis=1) < 1e-3) > 0.9)
 
 
-def _shaded(mesh: Mesh) -> Mesh:
+def _add_normals(mesh: Mesh) -> Mesh:
     """Return the mesh with computed normals: smooth, except over edges sharper than the crease angle."""
     corners = mesh.positions.astype(float)[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # as long as twice the area
@@ -255,7 +255,7 @@ def _pairs(point: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
     return order[mine], order[start[mine] + step]
 
 
-def _painted(mesh: Mesh) -> Mesh:
+def _paint_vertices(mesh: Mesh) -> Mesh:
     """Replace the texture by vertex colours where both look the same: fewer vertices, draws and samples.
 
     They do where the texture is a palette, or where triangles are finer than its details: there the colour inside a
@@ -282,7 +282,7 @@ def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.u
     return colors
 
 
-def _welded(mesh: Mesh) -> Mesh:
+def _weld(mesh: Mesh) -> Mesh:
     """Merge equal vertices: the renderer's work is per vertex, and files often repeat them for every triangle."""
     columns = [mesh.positions, np.round(mesh.normals * 50), mesh.colors.astype(np.float32)]
     if mesh.uv is not None:
@@ -302,7 +302,7 @@ def _welded(mesh: Mesh) -> Mesh:
         colors=mesh.colors[first],
         uv=None if mesh.uv is None else mesh.uv[first],
         faces=place[faces],
-        closed=_closed(mesh),
+        closed=_is_closed(mesh),
     )
 
 
@@ -312,7 +312,7 @@ def _rows(*columns: NDArray[Any]) -> NDArray[Any]:
     return table.view([("", f"V{table.shape[1] * 4}")]).reshape(-1)
 
 
-def _closed(mesh: Mesh) -> bool:
+def _is_closed(mesh: Mesh) -> bool:
     """Return whether the mesh encloses a volume, with its faces turned outwards."""
     _, corner = np.unique(_rows(mesh.positions), return_inverse=True)
     faces = corner.reshape(-1)[mesh.faces].astype(np.int64)
@@ -326,7 +326,7 @@ def _closed(mesh: Mesh) -> bool:
 # --- fewer triangles --------------------------------------------------------------------------------------------------
 
 
-def simplified(mesh: Mesh) -> Mesh:
+def simplify_mesh(mesh: Mesh) -> Mesh:
     """Return a heavy mesh with fewer triangles, with no visible difference in a large picture; others as they are."""
     if len(mesh.faces) <= _HEAVY:
         return mesh
@@ -334,20 +334,20 @@ def simplified(mesh: Mesh) -> Mesh:
     corners = points[mesh.faces]
     double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     mean_edge = np.sqrt(double_area.sum() * 2 / np.sqrt(3) / len(mesh.faces))  # as if all were equilateral
-    return _clustered(mesh, min(_EDGES * mean_edge, _SHARE * float(np.linalg.norm(np.ptp(points, axis=0)))))
+    return _cluster(mesh, min(_EDGES * mean_edge, _SHARE * float(np.linalg.norm(np.ptp(points, axis=0)))))
 
 
-def coarsened(mesh: Mesh) -> Mesh:
-    """Return a heavy mesh with a third of the triangles of :func:`simplified`, for small pictures; others as they are.
+def coarsen_mesh(mesh: Mesh) -> Mesh:
+    """Return a heavy mesh with a third of the triangles of :func:`simplify_mesh`, for small pictures; others unchanged.
 
     ``cell`` of the result is the size of the omitted details: see :class:`.scene.Mesh`.
     """
     if len(mesh.faces) <= _COARSE_HEAVY:
         return mesh
-    return _clustered(mesh, _COARSE_SHARE * float(np.linalg.norm(np.ptp(mesh.positions.astype(float), axis=0))))
+    return _cluster(mesh, _COARSE_SHARE * float(np.linalg.norm(np.ptp(mesh.positions.astype(float), axis=0))))
 
 
-def _clustered(mesh: Mesh, cell: float) -> Mesh:
+def _cluster(mesh: Mesh, cell: float) -> Mesh:
     """Merge the vertices of one colour in each cell of a grid.
 
     The one that is kept is the nearest to the planes of all their triangles (quadrics: Garland and Heckbert, 1997;

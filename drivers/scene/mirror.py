@@ -44,7 +44,7 @@ class WorldMirror:
         self._number = 0
         self._t: float | None = None
 
-    def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+    def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Note an edit; it is made before the first snapshot of its revision is shown. They may come in any order."""
         self._edits[revision] = (method, params)
 

@@ -362,7 +362,7 @@ def create_context() -> Any:
         raise DriverMissing(f"{error}; pip install moderngl") from error
     options: dict[str, Any] = {"standalone": True, "backend": "egl"}
     try:
-        with _one_thread():
+        with _limit_threads():
             context: Any = moderngl.create_context(require=330, **options)
     except Exception as error:  # glcontext raises bare Exceptions
         raise DriverMissing(f"{error}; {_REMEDY}") from error
@@ -371,7 +371,7 @@ def create_context() -> Any:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def _limit_threads() -> Iterator[None]:
     """Limit Mesa's software renderer, while it starts, to one thread; more would compete with the servo's process."""
     name = "LP_NUM_THREADS"
     before = os.environ.get(name)

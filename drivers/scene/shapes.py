@@ -234,7 +234,7 @@ def cylinder(radius: float, length: float) -> Mesh:
     h = length / 2
     profile = [(0, -h), (radius, -h), (radius, -h), (radius, h), (radius, h), (0, h)]
     normals = [(0, -1), (0, -1), (1, 0), (1, 0), (0, 1), (0, 1)]
-    return _revolved(np.array(profile, float), np.array(normals, float))
+    return _revolve(np.array(profile, float), np.array(normals, float))
 
 
 def capsule(radius: float, length: float) -> Mesh:
@@ -250,7 +250,7 @@ def _capsule(radius: float, length: float, segments: int) -> Mesh:
     lower, below = (upper * mirror)[::-1], (cap * mirror)[::-1]
     if not length:  # one circle at the equator
         lower, below = lower[:-1], below[:-1]
-    return _revolved(np.concatenate([lower, upper]), np.concatenate([below, cap]), segments)
+    return _revolve(np.concatenate([lower, upper]), np.concatenate([below, cap]), segments)
 
 
 def _in_two_levels(radius: float, make: Callable[[int], Mesh]) -> Mesh:
@@ -265,7 +265,7 @@ def plane() -> Mesh:
     return _white(positions, np.tile([0.0, 0, 1], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), closed=False)
 
 
-def _revolved(profile: Array, normals: Array, segments: int = _SEGMENTS) -> Mesh:
+def _revolve(profile: Array, normals: Array, segments: int = _SEGMENTS) -> Mesh:
     """Return the surface of revolution around z of a profile (P, 2) of radius and height, from bottom to top."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)

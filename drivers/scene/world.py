@@ -383,7 +383,7 @@ class SimulatedWorld(SceneEngine[B]):
             raise ConfigError(problems)
         self.load_bodies([record])
         self._report_overlaps([self.bodies[record.name]])
-        return self._edited("add", spec=to_json(record))
+        return self._publish_edit("add", spec=to_json(record))
 
     def remove(self, name: str) -> int:
         """Remove an object, not a robot, and return the new revision."""
@@ -395,7 +395,7 @@ class SimulatedWorld(SceneEngine[B]):
         self.forces = [force for force in self.forces if force.body is not body]
         self._renumber()
         self.arrange_bodies(())
-        return self._edited("remove", name=name)
+        return self._publish_edit("remove", name=name)
 
     def set_color(self, name: str, rgba: Sequence[float]) -> int:
         """Set the colour of all links of a body (red, green, blue, alpha in 0..1) and return the new revision."""
@@ -404,14 +404,14 @@ class SimulatedWorld(SceneEngine[B]):
         if not all(0.0 <= value <= 1.0 for value in color):
             raise CommandError(f"rgba of {name!r} must be numbers in 0..1, not {color}")
         self.paint_body(body, color)
-        return self._edited("set_color", name=name, rgba=color)
+        return self._publish_edit("set_color", name=name, rgba=color)
 
     def randomize(self, values: Mapping[str, Any], seed: int) -> int:
         """Take the values that devices and pictures read (see :mod:`hal.randomization`) and return the new revision."""
         self.randomized = Randomized.take(values, seed)
-        return self._edited("randomize", values=dict(values), seed=seed)
+        return self._publish_edit("randomize", values=dict(values), seed=seed)
 
-    def _edited(self, method: str, **params: Any) -> int:
+    def _publish_edit(self, method: str, **params: Any) -> int:
         self._changes += 1
         if method in ("add", "remove"):
             self._edited_at = self.steps

@@ -49,7 +49,7 @@ class Terminal:
 
     def take(self) -> None:
         """Change the settings, and drop what was typed before. Raises OSError when the terminal is gone."""
-        with _without_job_control(), _as_os_error():
+        with _block_job_control(), _as_os_error():
             attributes = termios.tcgetattr(self.fd)
             if self._before is None:
                 self._before = termios.tcgetattr(self.fd)
@@ -65,7 +65,7 @@ class Terminal:
         poller.register(self.fd, select.POLLIN)
         if not poller.poll(1e3 * timeout):
             return b""
-        with _without_job_control():
+        with _block_job_control():
             try:
                 data = os.read(self.fd, 65536)
             except BlockingIOError:  # another reader was faster
@@ -85,7 +85,7 @@ class Terminal:
         """
         if self.fd < 0:
             return
-        with contextlib.suppress(OSError), _without_job_control():
+        with contextlib.suppress(OSError), _block_job_control():
             if self._before is not None and self.is_taken():
                 with _as_os_error():
                     termios.tcsetattr(self.fd, termios.TCSANOW, self._before)
@@ -125,7 +125,7 @@ def _as_os_error() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _without_job_control() -> Iterator[None]:
+def _block_job_control() -> Iterator[None]:
     """Block job-control signals: reading or writing in the background fails instead of suspending the program."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _JOB_CONTROL)
     try:

@@ -211,7 +211,7 @@ class BodiesView:
 
     def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Note an edit of the world; it is repeated here before the first snapshot of its revision is shown."""
-        self._mirror.edited(method, params, revision)
+        self._mirror.note_edit(method, params, revision)
 
     def update(self, *, watched: bool) -> None:
         """Follow the world, and update the page if one is open."""

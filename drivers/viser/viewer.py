@@ -106,7 +106,7 @@ class ViserViewer(Viewer3D):
         if robot not in self._robots:
             raise DeviceNotFound(f"the 3D view has no robot {robot!r}; it has: {', '.join(sorted(self._robots))}")
 
-    def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+    def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Repeat an edit of the simulated world before a snapshot of that revision is shown."""
         with self._lock:
             self._edits.append({"method": method, "params": params, "revision": revision})

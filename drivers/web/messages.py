@@ -153,11 +153,11 @@ def _pad_message(_: _Names, seen: object, since: object, axes: object, buttons: 
 
 
 def _setting(known: _Names, name: object, value: object) -> DriverRequest:
-    name = _one_of(name, SETTINGS)
+    name = _check_choice(name, SETTINGS)
     if name == "speed":
         value = _number(value, _MIN_SPEED, 1.0)
     else:
-        value = _one_of(value, {"robot": known.robots, "frame": FRAMES, "scene": ("reset",)}[name])
+        value = _check_choice(value, {"robot": known.robots, "frame": FRAMES, "scene": ("reset",)}[name])
     return DriverRequest("change settings", {"setting": name, "value": value})
 
 
@@ -168,20 +168,23 @@ def _request(what: str, key: str, value: object) -> DriverRequest:
 def _watch(known: _Names, cameras: object) -> WatchRequest:
     if not isinstance(cameras, list):
         raise MalformedMessage("not a list of cameras")
-    return WatchRequest(tuple(dict.fromkeys(_one_of(name, known.cameras) for name in cameras)))
+    return WatchRequest(tuple(dict.fromkeys(_check_choice(name, known.cameras) for name in cameras)))
 
 
 _MESSAGES: dict[str, tuple[set[str], Callable[..., PageMessage]]] = {
     "pad": ({"seen", "since", "axes", "buttons"}, _pad_message),
-    "away": ({"why"}, lambda _, why: PageLeft(_LEFT[_one_of(why, _LEFT)])),
+    "away": ({"why"}, lambda _, why: PageLeft(_LEFT[_check_choice(why, _LEFT)])),
     "lease": ({"take"}, lambda _, take: ControlRequest(_flag(take))),
     "stop": (set(), lambda _: StopRequest()),
-    "recover": ({"robot"}, lambda known, robot: _request("clear a fault", "recover", _one_of(robot, known.robots))),
+    "recover": (
+        {"robot"},
+        lambda known, robot: _request("clear a fault", "recover", _check_choice(robot, known.robots)),
+    ),
     "demo": ({"play"}, lambda _, play: _request("play the tour", "demo", _flag(play))),
-    "action": ({"action"}, lambda _, action: _request("steer the recording", "action", _one_of(action, ACTIONS))),
+    "action": ({"action"}, lambda _, action: _request("steer the recording", "action", _check_choice(action, ACTIONS))),
     "setting": ({"name", "value"}, _setting),
     "watch": ({"cameras"}, _watch),
-    "drawn": ({"camera"}, lambda known, camera: PictureDrawn(_one_of(camera, known.cameras))),
+    "drawn": ({"camera"}, lambda known, camera: PictureDrawn(_check_choice(camera, known.cameras))),
 }
 """Type of a message -> exactly its other keys, and what makes its record of them."""
 
@@ -201,7 +204,7 @@ def _flag(value: object) -> bool:
     return value
 
 
-def _one_of(value: object, known: Collection[str]) -> str:
+def _check_choice(value: object, known: Collection[str]) -> str:
     if not isinstance(value, str) or value not in known:
         raise MalformedMessage("an unknown name")
     return value

@@ -26,7 +26,7 @@ from hal.types import STREAMS
 
 from .messages import MalformedMessage, PictureDrawn, WatchRequest, parse
 from .sockets import PageSocket, PageSockets
-from .telemetry import rounded
+from .telemetry import round_number
 
 _HEADER = struct.Struct("<BBHIdf")  # camera, 0, 0, seq, t, age
 _SEQ_MASK = 0xFFFFFFFF
@@ -151,7 +151,7 @@ class _CameraFeed:
         span = times[-1] - times[0] if times else 0.0
         return {
             "fps": round((len(times) - 1) / span, 1) if span > 0.0 else None,
-            "age": rounded(now - self.frame.t) if self.frame is not None else None,
+            "age": round_number(now - self.frame.t) if self.frame is not None else None,
         }
 
 
@@ -279,7 +279,7 @@ def compress(frame: RawFrame, spec: CameraSpec) -> bytes:
     """
     if frame.color is not None:
         small = spec.width * spec.height <= _SMALL
-        return _jpeg(smoothed(frame.color) if small else frame.color, "RGB", "420")
+        return _jpeg(smooth_picture(frame.color) if small else frame.color, "RGB", "420")
     grey = next((getattr(frame, name) for name in spec.streams if not STREAMS[name].exact), None)
     if grey is not None:
         return _jpeg(grey[:, :, np.newaxis], "GRAY", "Gray")
@@ -294,7 +294,7 @@ def _jpeg(image: NDArray[np.uint8], colors: str, sampling: str) -> bytes:
     return bytes(data)
 
 
-def smoothed(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def smooth_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a smoothed copy of an RGB picture (h, w, 3) for display: no staircases, no lone pixels.
 
     A renderer without a graphics card has no time for several samples per pixel. Every pixel on an edge becomes the

@@ -18,7 +18,7 @@ _GRIPPER_MAX_AGE = 0.5
 _DIGITS = 5
 
 
-def rounded(value: float) -> float | None:
+def round_number(value: float) -> float | None:
     """Return a number rounded for a page, to 10 um or 10 urad; None if it is not finite."""
     return round(value, _DIGITS) if math.isfinite(value) else None
 
@@ -46,7 +46,7 @@ class Telemetry:
                 "rate_hz": host["rate_hz"],
                 "ticks": record.ticks,
                 "missed": record.missed,
-                "silent": rounded(now - record.t) if record.ticks or record.ready else None,
+                "silent": round_number(now - record.t) if record.ticks or record.ready else None,
             }
             for name, mail in group.robots.items():
                 robots[name] = _robot(mail, self._grippers.get(name), now)
@@ -65,7 +65,7 @@ def _robot(mail: RobotMail, gripper: GripperMail | None, now: float) -> dict[str
         return {"lost": f"last state {age:.1f} s old"}
     return {
         "t": state.stamp.t,
-        "age": rounded(age),
+        "age": round_number(age),
         "status": str(state.status),
         "trip": str(state.trip),
         "trip_text": state.trip.text if state.trip is not Trip.NONE else "",
@@ -95,8 +95,8 @@ def _gripper(mail: GripperMail | None, now: float) -> dict[str, Any] | None:
         return None
     state = record.state
     return {
-        "width": rounded(state.width),
-        "width_target": rounded(state.width_target),
+        "width": round_number(state.width),
+        "width_target": round_number(state.width_target),
         "moving": state.moving,
         "grasped": state.grasped,
     }
@@ -105,9 +105,9 @@ def _gripper(mail: GripperMail | None, now: float) -> dict[str, Any] | None:
 def _deadman(record: DeadmanRecord | None, now: float) -> dict[str, Any] | None:
     if record is None:
         return None
-    return {"held": record.held, "connected": record.connected, "age": rounded(now - record.t_alive)}
+    return {"held": record.held, "connected": record.connected, "age": round_number(now - record.t_alive)}
 
 
 def _list(values: Any) -> list[float | None]:
     numbers: Iterable[float] = values.tolist()
-    return [rounded(value) for value in numbers]
+    return [round_number(value) for value in numbers]

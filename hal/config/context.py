@@ -248,8 +248,8 @@ def load_urdf(
     except (ValueError, OSError) as error:
         problems.add(path, "", str(error), "bad_urdf")
         return None
-    if urdf.without_mass():
-        links = ", ".join(urdf.without_mass())
+    if urdf.find_massless():
+        links = ", ".join(urdf.find_massless())
         warnings.append(f"{path}: no <inertial> in {links}; the simulator makes up a mass")
     return urdf
 

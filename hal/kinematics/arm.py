@@ -134,7 +134,7 @@ class Kinematics:
 
     def _frame_jacobian(self, q: Sequence[float] | Array, number: int, axes: Any) -> Array:
         """Return the Jacobian (6, n) of a frame of pinocchio's along these axes."""
-        jacobian: Array = self._pin.computeFrameJacobian(self._model, self._data, self._ordered(q), number, axes)
+        jacobian: Array = self._pin.computeFrameJacobian(self._model, self._data, self._reorder(q), number, axes)
         if self.n == 1:
             jacobian = jacobian.reshape(6, 1)  # pinocchio returns a vector
         return jacobian if self._columns is None else jacobian[:, self._columns]
@@ -331,14 +331,14 @@ class Kinematics:
             raise DeviceNotFound(text, code="unknown_link")
         return frame
 
-    def _ordered(self, q: Sequence[float] | Array) -> Array:
+    def _reorder(self, q: Sequence[float] | Array) -> Array:
         values = np.asarray(q, float)
         if values.shape != self._shape:
             raise CommandError(f"q must have shape {self._shape}, not {values.shape}")
         return values if self._inverse_columns is None else values[self._inverse_columns]
 
     def _forward(self, q: Sequence[float] | Array) -> None:
-        self._pin.forwardKinematics(self._model, self._data, self._ordered(q))
+        self._pin.forwardKinematics(self._model, self._data, self._reorder(q))
 
 
 def _exponential(axis: Array, angle: float) -> Array:

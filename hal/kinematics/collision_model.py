@@ -260,7 +260,7 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
     for a, ((name, _, kinematics, position, orientation), shapes) in enumerate(zip(arms, loaded, strict=True)):
         base = pin.XYZQUATToSE3(np.array([*position, *Pose((0, 0, 0), orientation).orientation]))
         first = model.njoints - 1
-        model = pin.appendModel(model, _renamed(shapes.model, f"{a}/"), 0, base)
+        model = pin.appendModel(model, _rename(shapes.model, f"{a}/"), 0, base)
         slices.append(slice(len(columns), len(columns) + len(kinematics.joints)))
         columns += [int(model.joints[model.getJointId(f"{a}/{joint}")].idx_q) for joint in kinematics.joints]
         for shape in shapes.shapes:
@@ -319,7 +319,7 @@ def _changed(urdf: str) -> int:
     return Path(urdf).stat().st_mtime_ns
 
 
-def _renamed(model: Any, prefix: str) -> Any:
+def _rename(model: Any, prefix: str) -> Any:
     """Return a copy of a model whose joints and frames have names of their own."""
     copy = model.copy()
     for k in range(1, copy.njoints):

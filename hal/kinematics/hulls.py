@@ -156,7 +156,7 @@ def convex_hull(points: Array) -> Hull:
     chosen = np.unique(np.concatenate([(part @ points.T).argmax(axis=1) for part in np.array_split(_sphere(), 16)]))
     hull = _qhull(points[chosen])
     for _ in range(ROUNDS):
-        outside = _outside(points, hull, EXACT * extent)
+        outside = _find_outside(points, hull, EXACT * extent)
         if not len(outside):
             break
         chosen = np.union1d(chosen, outside)
@@ -172,7 +172,7 @@ def _sphere() -> Array:
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
-def _outside(points: Array, hull: Hull, tolerance: float) -> NDArray[np.intp]:
+def _find_outside(points: Array, hull: Hull, tolerance: float) -> NDArray[np.intp]:
     """Return the point that is the farthest outside of each face, if it is farther than ``tolerance``."""
     corners = hull.points[hull.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

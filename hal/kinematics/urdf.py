@@ -161,7 +161,7 @@ class UrdfModel:
             found[joint.child] = found[joint.parent] @ Pose(*joint.placement(values))
         return found
 
-    def without_mass(self) -> list[str]:
+    def find_massless(self) -> list[str]:
         """Return the links that move and have shapes, but no ``<inertial>``: simulators make up a mass for them."""
         return [
             name

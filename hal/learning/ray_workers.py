@@ -144,18 +144,18 @@ class _EpisodeActor:
         def start() -> None:
             self.worker = EpisodeWorker(*config)
 
-        return _packed(start)
+        return _pack_result(start)
 
     def make(self, number: int) -> dict[str, Any]:
         """Make an episode."""
-        return _packed(lambda: self.worker.make(number))
+        return _pack_result(lambda: self.worker.make(number))
 
     def close(self) -> dict[str, Any]:
         """End the worker's recorder."""
-        return _packed(self.worker.close)
+        return _pack_result(self.worker.close)
 
 
-def _packed(call: Callable[[], Any]) -> dict[str, Any]:
+def _pack_result(call: Callable[[], Any]) -> dict[str, Any]:
     try:
         return {"result": call()}
     except Exception as error:

@@ -167,7 +167,7 @@ class DatasetBuilder:
             _, episode, label = self.sources[number]
             stats: dict[str, Any] = {video_key(name): {} for name in self._places}
             if kept is None:
-                stats |= {key: column_stats(values[:, None]) for key, values in self._changed(number).items()}
+                stats |= {key: column_stats(values[:, None]) for key, values in self._change_columns(number).items()}
             first = self.starts[number] - self.starts[begin]
             place = EpisodePlace(group, (group, first), {name: at[number] for name, at in self._places.items()})
             about = episode.info | {"episode": number} | label._asdict() | place.as_json()
@@ -207,7 +207,7 @@ class DatasetBuilder:
         with dataset_errors(episode._layout.root, path, episode.number):
             return self._entries(path)[episode.number]
 
-    def _changed(self, number: int) -> dict[str, NDArray[Any]]:
+    def _change_columns(self, number: int) -> dict[str, NDArray[Any]]:
         """Return the columns (rows,) of an episode that depend on its number and its label."""
         _, episode, label = self.sources[number]
         rows = episode.length
@@ -284,7 +284,7 @@ class DatasetBuilder:
                 episode = self.sources[number].episode
                 table = episode.read_table().replace_schema_metadata()
                 with dataset_errors(episode._layout.root, episode._layout.root / episode.data_file, episode.number):
-                    for key, values in self._changed(number).items():
+                    for key, values in self._change_columns(number).items():
                         table = table.set_column(table.schema.get_field_index(key), key, pa.array(values))
                     if file is None:
                         file = stack.enter_context(pq.ParquetWriter(path, table.schema, write_page_checksum=True))

@@ -90,7 +90,7 @@ class DepthFile:
 
     def add_units(self, units: Units | None) -> None:
         """Append one row's picture (H, W), in the file's units; None repeats the one before."""
-        payload = b"" if units is None else self._compressor.compress(_shuffled(units))
+        payload = b"" if units is None else self._compressor.compress(_shuffle(units))
         _write(self._file, _RECORD.pack(len(payload), crc32(payload)) + payload)
 
 
@@ -130,7 +130,7 @@ class DepthReader:
         with self.path.open("rb") as file:
             for k, length in enumerate(self._places[:, 1]):
                 if length:
-                    picture = self._decoded(file, k)
+                    picture = self._decode(file, k)
                 yield picture
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
@@ -147,7 +147,7 @@ class DepthReader:
         if not self._places[own][1]:
             return np.zeros(self.shape, np.float32)
         with self.path.open("rb") as file:
-            depth: NDArray[np.float32] = self._decoded(file, own).astype(np.float32) * np.float32(self.unit)
+            depth: NDArray[np.float32] = self._decode(file, own).astype(np.float32) * np.float32(self.unit)
             return depth
 
     def stored_row(self, k: int) -> int:
@@ -157,7 +157,7 @@ class DepthReader:
             own -= 1
         return own
 
-    def _decoded(self, file: io.BufferedReader, k: int) -> Units:
+    def _decode(self, file: io.BufferedReader, k: int) -> Units:
         """Return the picture that is stored in record ``k``."""
         import zstandard
 
@@ -167,7 +167,7 @@ class DepthReader:
         data = file.read(length)
         if crc32(data) != check or zstandard.frame_content_size(data) != 2 * math.prod(self.shape):
             raise ValueError(f"picture {k} is damaged")
-        return _unshuffled(zstandard.ZstdDecompressor().decompress(data), self.shape)
+        return _unshuffle(zstandard.ZstdDecompressor().decompress(data), self.shape)
 
 
 def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[int, int]]:
@@ -187,13 +187,13 @@ def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[int, int]]:
         yield start, length
 
 
-def _shuffled(units: Units) -> bytes:
+def _shuffle(units: Units) -> bytes:
     steps = units.copy()
     steps[:, 1:] -= units[:, :-1]
     return np.ascontiguousarray(steps.view(np.uint8).reshape(-1, 2).T).tobytes()
 
 
-def _unshuffled(data: bytes, shape: tuple[int, int]) -> Units:
+def _unshuffle(data: bytes, shape: tuple[int, int]) -> Units:
     steps = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(2, -1).T).view("<u2").reshape(shape)
     units: Units = np.cumsum(steps, axis=1, dtype=np.uint16)
     return units

@@ -320,13 +320,13 @@ class Episode:
             height, width, _ = self._meta["features"][path.parent.parent.name]["shape"]
             pictures = read_video(path, self.first_picture(path), self.fps)
             if STREAMS[stream].shape:
-                return self._each(path, pictures, (height, width, 3))
-            return self._each(path, (picture[:, :, 0] for picture in pictures), (height, width))
+                return self._yield_pictures(path, pictures, (height, width, 3))
+            return self._yield_pictures(path, (picture[:, :, 0] for picture in pictures), (height, width))
         reader = self._depth_reader(path)
         if stream == "depth":
-            return self._each(path, iter(reader), reader.shape)
+            return self._yield_pictures(path, iter(reader), reader.shape)
         dtype, lowest = STREAMS[stream].dtype, int(STREAMS[stream].lowest)
-        return self._each(
+        return self._yield_pictures(
             path, ((units.astype(np.int32) + lowest).astype(dtype) for units in reader.units()), reader.shape
         )
 
@@ -395,7 +395,7 @@ class Episode:
                 else:
                     self._check_count(path, len(DepthReader(path)))
 
-    def _each(self, path: Path, pictures: Iterator[P], shape: tuple[int, ...]) -> Iterator[P]:
+    def _yield_pictures(self, path: Path, pictures: Iterator[P], shape: tuple[int, ...]) -> Iterator[P]:
         """Yield one picture per row, each of ``shape``; pictures of a next episode may follow in a video."""
         count = 0
         with dataset_errors(self._layout.root, path, self.number):

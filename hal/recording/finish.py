@@ -330,7 +330,7 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
             made.append((video, layout.video(name, place.video(name)[0])))
         for name in camera.depths:
             made.append((rest.folder / f"{name}.depth", layout.depth(name, number)))
-    place, entries = _continued(layout, closed, place, start, fps, stats)
+    place, entries = _continue_episode(layout, closed, place, start, fps, stats)
     own, name, common = split_about(closed | place.as_json())
     if not layout.common(name).exists():
         write_json(final / "common.json", common)
@@ -357,7 +357,7 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
     return [(str(source.relative_to(rest.folder)), str(target.relative_to(layout.root))) for source, target in made]
 
 
-def _continued(
+def _continue_episode(
     layout: DatasetLayout,
     about: Mapping[str, Any],
     place: EpisodePlace,

@@ -500,7 +500,7 @@ def _panel(canvas: SheetCanvas, content: EpisodeContent, curve: _Curve, left: fl
         canvas.line([(x, top), (x, top + _PANEL)], LIGHT)
         canvas.text(x, top + _PANEL + 3, f"{tick:g} s", 11, GREY, "ma")
     for values, colour, thick in ((curve.commanded, _COMMANDED, 3.0), (curve.measured, _MEASURED, 1.4)):
-        for part in _known(values):
+        for part in _find_runs(values):
             canvas.line([at(float(content.grid[k]), float(values[k])) for k in part], colour, thick)
 
 
@@ -512,7 +512,7 @@ def _range(curve: _Curve) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def _known(values: NDArray[np.float64]) -> Iterator[list[int]]:
+def _find_runs(values: NDArray[np.float64]) -> Iterator[list[int]]:
     """Yield runs of rows that hold a number."""
     part: list[int] = []
     for k, known in enumerate(np.isfinite(values).tolist()):

@@ -215,13 +215,13 @@ class Anchoring:
         self.skipped += cycles - 1
         if cycles >= _LONGEST:
             return self._resume(reading)
-        took = _continued([self._motion[0], *self._track], cycles - 1)
+        took = _extrapolate([self._motion[0], *self._track], cycles - 1)
         off, step_off = self._distances(q, dq, took)
         if cycles == 1 and off <= _ROUNDED and step_off <= _ROUNDED_STEP:
             self._track, self._dq = took[:3], dq
             self.error = max(self.error, off)
             return False
-        lost = _continued(self._track, cycles)
+        lost = _extrapolate(self._track, cycles)
         lost_off, lost_step_off = self._distances(q, dq, lost)
         # The speeds distinguish a small loss from none: they are a thousand times as exact as the positions.
         close = max(cycles * _CLOSE, step_off / _CLOSER)
@@ -233,7 +233,7 @@ class Anchoring:
         self.lost += count
         agreed = step_off <= cycles * _ROUNDED
         if agreed and dq is not None and self._dq is not None:
-            track = self._refined(start, cycles, int(is_lost), self._dq, dq)
+            track = self._refine(start, cycles, int(is_lost), self._dq, dq)
         self._dq = dq if agreed else None
         if count and not self._allows(at := self._state(track)):
             self._note_taken()
@@ -243,7 +243,7 @@ class Anchoring:
             self._smoother.anchor(*at[:3])
         return count > 0
 
-    def _refined(self, q: Floats, cycles: int, more: int, before: Floats, dq: Floats) -> list[Floats]:
+    def _refine(self, q: Floats, cycles: int, more: int, before: Floats, dq: Floats) -> list[Floats]:
         """Return where the device was in its last three cycles, newest first, by the speeds that it reports.
 
         They are more exact than the positions, so that what was too small to be noticed does not grow. In all
@@ -354,7 +354,7 @@ class Anchoring:
         return True
 
 
-def _continued(track: list[Floats], cycles: int) -> list[Floats]:
+def _extrapolate(track: list[Floats], cycles: int) -> list[Floats]:
     """Return positions a cycle apart, newest first, extended by ``cycles`` at constant acceleration, rad."""
     for _ in range(cycles):
         track = [[3.0 * (a - b) + c for a, b, c in zip(*track[:3], strict=True)], *track]

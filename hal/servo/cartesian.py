@@ -144,12 +144,12 @@ class TwistMotion(_CartesianMotion):
                 self._held[part] = False
             elif not self._held[part]:  # still braking: wherever it comes to rest is the goal
                 goal[3 * part : 3 + 4 * part] = pose[3 * part : 3 + 4 * part]
-                self._held[part] = self._at_rest(part)
+                self._held[part] = self._is_at_rest(part)
         x, y, z, *orientation = goal
         vx, vy, vz, wx, wy, wz = twist
         self._goal = [x + dt * vx, y + dt * vy, z + dt * vz, *apply_rotation(orientation, (dt * wx, dt * wy, dt * wz))]
 
-    def _at_rest(self, part: int) -> bool:
+    def _is_at_rest(self, part: int) -> bool:
         _, jacobian = self.envelope.pose_and_jacobian()
         return hypot(*jacobian[3 * part : 3 * part + 3].dot(self.smoother.dq).tolist()) < _QUIET[part]
 

@@ -207,7 +207,7 @@ class CollisionGuard:
         stop = stop or _JointStop(q, smoother.dq_next, smoother.ddq_next, smoother)
         near = [] if around.stays_clear(q, stop.ways) else around.near(q, stop.ways)
         tight, present = [], []
-        for k in self._unproven(near, stop):
+        for k in self._find_unproven(near, stop):
             now = self._present(k, on_path)
             # What is at its margin counts as in it: from there hardly a way out could be proven.
             if k not in self._floors and now > self._margins[k] + _TOLERANCE:
@@ -281,7 +281,7 @@ class CollisionGuard:
         """Return the way (rad) in which a joint brakes gently from the speed ``v`` (rad/s), and of two ticks before."""
         return stop_distance(v, _BRAKE * A, _BRAKE_JERK * J) + 2.0 * self._smoother.dt * v
 
-    def _unproven(self, pairs: Sequence[int], stop: Stop) -> Iterator[int]:
+    def _find_unproven(self, pairs: Sequence[int], stop: Stop) -> Iterator[int]:
         """Yield the pairs for which it is not proven that a stop keeps their margins.
 
         Between two places at which shapes have the distances d and e, while they come at most w nearer, they are

@@ -48,7 +48,7 @@ __all__ = [
     "controller_data",
     "controller_of",
     "resolve",
-    "with_gains",
+    "replace_gains",
 ]
 
 Array = NDArray[np.float64]
@@ -275,7 +275,7 @@ def _spread(name: str, gain: Gain, count: int) -> tuple[float, ...]:
 _FIXED = ("frame", "position_only")
 
 
-def with_gains(controller: Controller, gains: dict[str, ArrayLike]) -> Controller:
+def replace_gains(controller: Controller, gains: dict[str, ArrayLike]) -> Controller:
     """Return a controller with other gains.
 
     Raises:
@@ -461,13 +461,13 @@ class ControllerLaw:
         if self.in_joints:
             if not tuned:
                 self._tune(arm.q, inertia.inverse, inertia)
-            self._stretched = lengths = self._shortened(q_set - tcp.q)
+            self._stretched = lengths = self._shorten(q_set - tcp.q)
             self._tau[0], self._tau[1] = self._damping.dot(lag), lengths.dot(self._stiffness)
         else:
             task = tcp.jacobian[: self._rows]
             if self._along_tcp:
                 self._turn = turn = _rotation(tcp.pose[3:])
-                task, error = _turned(turn.T, task), _turned(turn.T, np.array(error)).tolist()
+                task, error = _rotate(turn.T, task), _rotate(turn.T, np.array(error)).tolist()
             eased = inertia.solve(task.T)  # M^-1 J'
             ease = task.dot(eased)
             ease += self._ease
@@ -486,7 +486,7 @@ class ControllerLaw:
         lengths[1, :3] = error[:3]
         if self._rows == 6:
             lengths[0, 3:] = error[3:]
-            self._shortened(lengths[0])
+            self._shorten(lengths[0])
         force: Array = lengths.dot(self._stiffness)
         force[0] += self._damping.dot(jacobian.dot(lag))
         self._stretched = lengths[1]
@@ -525,7 +525,7 @@ class ControllerLaw:
             return np.asarray(self._tcp.jacobian[:3].dot(velocity), np.float64)
         return np.asarray(self._turn.dot(velocity[:3]) if self._along_tcp else velocity[:3], np.float64)
 
-    def _shortened(self, lengths: Array) -> Array:
+    def _shorten(self, lengths: Array) -> Array:
         """Cut the lengths (k,) of springs, in place, so that none moves what it holds too fast when let go.
 
         A critically damped spring of length x that is let go reaches the speed w x / e.
@@ -582,7 +582,7 @@ def _tuple(gain: Gain | None) -> tuple[float, ...]:
     return gain
 
 
-def _turned(turn: Array, values: Array) -> Array:
+def _rotate(turn: Array, values: Array) -> Array:
     """Return values (3, ...) or (6, ...) with each three of them turned by a matrix (3, 3)."""
     if len(values) == 3:
         return turn @ values

@@ -172,7 +172,7 @@ class TcpReference:
         if near + speed * self._reach_length * dist(smoother.q, self._at) <= cap:
             return True
         self._put_centre(dq)
-        return self._centre_speed + self._stretch * dist(now, dq) + speed * self._moved() <= cap
+        return self._centre_speed + self._stretch * dist(now, dq) + speed * self._bound_distance() <= cap
 
     def _put_centre(self, dq: Floats) -> None:
         """Compute the tcp's greatest speed for all shares of the joint speeds ``dq`` (n,), rad/s."""
@@ -215,7 +215,7 @@ class TcpReference:
             if self._like_proven_stop(mean, fastest) <= cap:
                 return True
             self._put_centre(dq)
-            if self._centre_speed + self._stretch * dist(mean, dq) + ramps + fastest * self._moved() <= cap:
+            if self._centre_speed + self._stretch * dist(mean, dq) + ramps + fastest * self._bound_distance() <= cap:
                 return True
         self._refresh()
         bound = self._fastest_in_stop(cap)
@@ -336,9 +336,9 @@ class TcpReference:
             if not -cap <= v <= cap:
                 return False
             left -= per_v * abs(v) + per_a * abs(a)
-        return self._moved() < left
+        return self._bound_distance() < left
 
-    def _moved(self) -> float:
+    def _bound_distance(self) -> float:
         """Return the greatest distance between the tcp at the set-point and that of the reference, m."""
         if self._at is self._smoother.q:
             return 0.0
@@ -349,7 +349,7 @@ class TcpReference:
 
     def _refresh(self) -> bool:
         """Move the reference to the set-point unless it is as good as there; returns whether it moved."""
-        if self._moved() <= _SAME:
+        if self._bound_distance() <= _SAME:
             return False
         self._move_reference()
         return True

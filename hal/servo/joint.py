@@ -170,7 +170,7 @@ class JointTargetMotion(ServoMotion):
         smoother, envelope = self.smoother, self.envelope
         q, dq = self._q, self._dq
         if not self._inside:
-            q, dq = self._into_limits([x + v * age for x, v in zip(q, dq, strict=True)], dq)
+            q, dq = self._clip_to_limits([x + v * age for x, v in zip(q, dq, strict=True)], dq)
             age = 0.0
         if self._direct and smoother.reach(q, envelope.velocity, envelope.allows):
             self._wanted = None
@@ -206,7 +206,7 @@ class JointTargetMotion(ServoMotion):
         limits = zip(q, dq, self.smoother.lower, self.smoother.upper, strict=True)
         return all(low <= x + v * age <= high for x, v, low, high in limits)
 
-    def _into_limits(self, q: list[float], dq: list[float]) -> tuple[list[float], list[float]]:
+    def _clip_to_limits(self, q: list[float], dq: list[float]) -> tuple[list[float], list[float]]:
         """Return the target and its speed, cut to the position limits."""
         lower, upper = self.smoother.lower, self.smoother.upper
         inside = [max(low, min(high, x)) for x, low, high in zip(q, lower, upper, strict=True)]
@@ -295,7 +295,7 @@ class ChunkMotion(JointTargetMotion):
         self._command = command
 
     def step(self, now: float) -> None:
-        q, dq = self._into_limits(*self._due(now))
+        q, dq = self._clip_to_limits(*self._due(now))
         self._follow_each(self._approach(q, dq, 0.0))
 
     def _split(self, values: Floats) -> tuple[list[float], list[list[float]]]:

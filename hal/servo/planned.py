@@ -436,7 +436,7 @@ class PathMotion(PlannedMotion):
                 )
         inside = [max(low, min(high, x)) for x, low, high in zip(goal, smoother.lower, smoother.upper, strict=True)]
         if self.envelope.workspace is not None:
-            self._check_tcp(_between(smoother.q, inside))
+            self._check_tcp(_interpolate(smoother.q, inside))
         self._reset()
         self._goal = inside
         self._whole_way = max([abs(x - y) for x, y in zip(inside, smoother.q, strict=True)])
@@ -466,7 +466,7 @@ class PathMotion(PlannedMotion):
             return min(limit / abs(d) for limit, d in zip(limits, along, strict=True) if d)
 
         speed = slowest(envelope.velocity)
-        fastest_tcp = envelope.stop_speed(along, _between(smoother.q, self._goal))
+        fastest_tcp = envelope.stop_speed(along, _interpolate(smoother.q, self._goal))
         if fastest_tcp * speed > envelope.goal_tcp_speed:
             speed = envelope.goal_tcp_speed / fastest_tcp
         acceleration = slowest(smoother.acceleration)
@@ -478,7 +478,7 @@ class PathMotion(PlannedMotion):
         self._s = 0.0
 
 
-def _between(start: Floats, goal: Floats) -> list[list[float]]:
+def _interpolate(start: Floats, goal: Floats) -> list[list[float]]:
     """Return joint positions (n,), rad, on the straight way from ``start`` to ``goal``."""
     count = min(_MOST_SAMPLES, 1 + ceil(max(abs(b - a) for a, b in zip(start, goal, strict=True)) / _SAMPLE))
     return [[a + k / count * (b - a) for a, b in zip(start, goal, strict=True)] for k in range(count + 1)]

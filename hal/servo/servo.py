@@ -255,9 +255,9 @@ class Servo:
         device = self._observe(reading, device)
         if streamed and not compared:
             self._compare(reading, device)
-        self._watchdog.update(now, inbox, self._at_rest(), device, late)
+        self._watchdog.update(now, inbox, self._is_at_rest(), device, late)
         faulty = device is _FAULT
-        if session is None or (self._course.ending and self._finished()):
+        if session is None or (self._course.ending and self._close_if_finished()):
             self._idle(RobotStatus.FAULT if faulty else RobotStatus.IDLE)
             return None
         self._accept_command(now, session, inbox.command)
@@ -370,7 +370,7 @@ class Servo:
         self._compliance.active = False
         if self._torque.active:
             self._torque.observe(None)
-        if self._session is None or (self._course.ending and self._finished()):
+        if self._session is None or (self._course.ending and self._close_if_finished()):
             self._idle(RobotStatus.LOST)
             return None
         self._forget_goals()
@@ -504,7 +504,7 @@ class Servo:
             if self._followed:
                 report.t_stop = now
             self._brake()
-            usual = RobotStatus.HOLDING if self._at_rest() else RobotStatus.STOPPING
+            usual = RobotStatus.HOLDING if self._is_at_rest() else RobotStatus.STOPPING
             if watchdog.trip:
                 usual = RobotStatus.TRIPPED
         self._followed = motion is not None
@@ -554,7 +554,7 @@ class Servo:
         report.held_back |= self._envelope.limited
         report.off_path = motion.lost
 
-    def _at_rest(self) -> bool:
+    def _is_at_rest(self) -> bool:
         """Return whether nothing moves, and positions or a controller (not bare torques) hold the arm."""
         return self._smoother.at_rest() and (not self._torque.active or self._compliance.active)
 
@@ -564,7 +564,7 @@ class Servo:
         self._compliance.end()
         self._anchoring.forget()
 
-    def _finished(self) -> bool:
+    def _close_if_finished(self) -> bool:
         """Close the session once it has come to rest; returns whether it is closed."""
         if self._torque.active and self._torque.blind:  # the device was left alone: it holds by itself
             self._leave_torques()

@@ -115,7 +115,7 @@ def stop_pieces(q: float, v: float, a: float, A: float, J: float) -> list[tuple[
     pieces, begin = [], 0.0
     for end, j in zip(ends, (jerk, 0.0, -jerk), strict=True):
         pieces.append((end, begin, q, v, a, j))
-        q, v, a = _moved(q, v, a, j, end - begin)
+        q, v, a = _advance(q, v, a, j, end - begin)
         begin = end
     return [*pieces, (inf, begin, q, 0.0, 0.0, 0.0)]
 
@@ -123,7 +123,7 @@ def stop_pieces(q: float, v: float, a: float, A: float, J: float) -> list[tuple[
 def stop_at(pieces: list[tuple[float, ...]], t: float) -> tuple[float, float, float]:
     """Return position, speed and acceleration ``t`` seconds into a stop."""
     begin, q, v, a, j = next(state for end, *state in pieces if t < end)
-    return _moved(q, v, a, j, t - begin)
+    return _advance(q, v, a, j, t - begin)
 
 
 def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tuple[float, float, float]:
@@ -134,7 +134,7 @@ def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tu
     return stop_at(stop_pieces(q, v, a, A, J), dt)
 
 
-def _moved(q: float, v: float, a: float, j: float, t: float) -> tuple[float, float, float]:
+def _advance(q: float, v: float, a: float, j: float, t: float) -> tuple[float, float, float]:
     return q + t * (v + t * (0.5 * a + t * j / 6.0)), v + t * (a + 0.5 * t * j), a + t * j
 
 
@@ -275,7 +275,7 @@ class JointSmoother:
         the smaller ones an arm at rest whose first step is refused would never move.
         """
         if not hypot(*dq) <= self.slowest:
-            dq = self._within_speed(dq)
+            dq = self._clip_speed(dq)
         self.guarded = False
         self._propose_velocity(dq)
         self.held_back = self._violations()
@@ -372,7 +372,7 @@ class JointSmoother:
         self.ddq_next = output.new_acceleration
         return isfinite(hypot(*self.q_next, *self.dq_next, *self.ddq_next))
 
-    def _within_speed(self, dq: Floats) -> Floats:
+    def _clip_speed(self, dq: Floats) -> Floats:
         if not isfinite(sum(dq)):  # a goal that is no number is no goal
             return self._zeros
         return [v if -cap <= v <= cap else (cap if v > 0.0 else -cap) for v, cap in zip(dq, self.velocity, strict=True)]

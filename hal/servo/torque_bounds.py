@@ -200,10 +200,10 @@ class TorqueBounds:
     def open_session(self, q: Floats) -> None:
         """Open a session with the arm at ``q`` (n,), rad: outside a limit it may only come back in."""
         self.velocity, self.tcp_speed = self._envelope.velocity, self._envelope.tcp_speed
-        self._ranges = _around(self._limits.lower, self._limits.upper, q, self._ranges)
+        self._ranges = _widen(self._limits.lower, self._limits.upper, q, self._ranges)
         workspace = self._envelope.workspace
         if workspace is not None:
-            self._box = _around(workspace.lower, workspace.upper, self._kinematics.fk(q)[:3], self._box)
+            self._box = _widen(workspace.lower, workspace.upper, self._kinematics.fk(q)[:3], self._box)
 
     # Torques within the bounds.
 
@@ -219,7 +219,7 @@ class TorqueBounds:
         if tau != commanded:
             envelope.limited |= Limited.TORQUE
         most, coupled = [_SHARE * v for v in self.velocity], [_COUPLED * v for v in self.velocity]
-        slowed = list(map(self._slowed, tau, arm.dq, arm.inertia.alone, most, self._torque))
+        slowed = list(map(self._slow_down, tau, arm.dq, arm.inertia.alone, most, self._torque))
         added = arm.inertia.added(slowed, self._lag)
         share = min(map(_share, arm.dq, added, coupled))
         if share < 1.0 or slowed != tau:
@@ -285,7 +285,7 @@ class TorqueBounds:
             envelope.limited |= Limited.TORQUE
         return cut
 
-    def _slowed(self, tau: float, v: float, inertia: float, most: float, limit: float) -> float:
+    def _slow_down(self, tau: float, v: float, inertia: float, most: float, limit: float) -> float:
         """Return ``tau`` cut to what leaves this joint at ``most`` rad/s: inertia (most - v) = tau T + tau^2 / (2 R).
 
         A joint that is faster is braked at least.
@@ -449,7 +449,7 @@ def _greatest_share(a: Any, b: Any, cap: float) -> float:
     return max(0.0, min(1.0, (sqrt(max(0.0, ab * ab + bb * rest)) - ab) / bb))
 
 
-def _around(
+def _widen(
     lower: Floats, upper: Floats, at: Floats, before: Sequence[tuple[float, float]]
 ) -> list[tuple[float, float]]:
     """Return the ranges from ``lower`` to ``upper``, widened where ``at`` is outside or at their edge.

@@ -52,7 +52,7 @@ def _half(bench: GripperBench) -> float:
     return bench.driver.spec.width_max / 2
 
 
-def _opened(bench: GripperBench) -> GripperBench:
+def _open_driver(bench: GripperBench) -> GripperBench:
     """Open the driver, and read once."""
     bench.driver.open()
     bench.driver.read(bench.pass_time())
@@ -85,12 +85,12 @@ class GripperContract(Contract):
     # Reading.
 
     def test_open_does_not_move_the_fingers(self, bench: GripperBench) -> None:
-        first, *_, last = _run(_opened(bench), 0.3)
+        first, *_, last = _run(_open_driver(bench), 0.3)
         assert last.width == pytest.approx(first.width, abs=1e-3), "open must not move the fingers"
         assert not last.moving
 
     def test_readings_are_in_range_and_stamped(self, bench: GripperBench) -> None:
-        spec = _opened(bench).driver.spec
+        spec = _open_driver(bench).driver.spec
         _move(bench, _half(bench))
         readings = _run(bench, 0.5)
         for reading in readings:
@@ -111,7 +111,7 @@ class GripperContract(Contract):
         assert readings[-1].seq > readings[0].seq, "new readings have new numbers"
 
     def test_no_call_blocks(self, bench: GripperBench) -> None:
-        _opened(bench)
+        _open_driver(bench)
         took = []
         for k in range(30):
             now = bench.pass_time()
@@ -127,7 +127,7 @@ class GripperContract(Contract):
 
     @needs("freeze")
     def test_a_frozen_device_repeats_its_stamps(self, bench: GripperBench) -> None:
-        _run(_opened(bench), 0.1)
+        _run(_open_driver(bench), 0.1)
         bench.freeze()
         _run(bench, 0.1)  # samples that were under way
         first, *_, last = _run(bench, 0.2)
@@ -139,7 +139,7 @@ class GripperContract(Contract):
 
     @pytest.mark.parametrize("share", [0.25, 0.75])
     def test_moves_reach_their_width_at_their_speed(self, bench: GripperBench, share: float) -> None:
-        spec = _opened(bench).driver.spec
+        spec = _open_driver(bench).driver.spec
         _move(bench, _half(bench))
         assert _run_until_rest(bench)[-1].width == pytest.approx(_half(bench), abs=_AT), "move takes a width in m"
         target = share * spec.width_max
@@ -155,7 +155,7 @@ class GripperContract(Contract):
         )
 
     def test_the_newest_command_wins(self, bench: GripperBench) -> None:
-        spec = _opened(bench).driver.spec
+        spec = _open_driver(bench).driver.spec
         _move(bench, _half(bench))
         assert _run_until_rest(bench)[-1].width < 0.6 * spec.width_max
         _move(bench, 0.0)
@@ -165,7 +165,7 @@ class GripperContract(Contract):
         assert last == pytest.approx(spec.width_max, abs=_AT), "a newer command replaces the one before it"
 
     def test_stop_holds_the_width(self, bench: GripperBench) -> None:
-        start = _opened(bench).driver.read(bench.pass_time()).width
+        start = _open_driver(bench).driver.read(bench.pass_time()).width
         _move(bench, _half(bench))
         assert _run_until_rest(bench)[-1].width != pytest.approx(start, abs=0.01)
         _move(bench, 0.0, 0.5)
@@ -181,7 +181,7 @@ class GripperContract(Contract):
 
     def test_close_does_not_move_the_fingers_and_may_be_repeated(self, bench: GripperBench) -> None:
         bench.driver.close()
-        _opened(bench)
+        _open_driver(bench)
         _move(bench, _half(bench))
         width = _run_until_rest(bench)[-1].width
         assert width == pytest.approx(_half(bench), abs=_AT)
@@ -193,7 +193,7 @@ class GripperContract(Contract):
         assert _run(bench, 0.1)[-1].width == pytest.approx(width, abs=_AT), "close must not move the fingers"
 
     def test_another_thread_may_close(self, bench: GripperBench) -> None:
-        _opened(bench)
+        _open_driver(bench)
         run_in_thread(bench.driver.close)
 
     def test_a_driver_that_is_not_open_raises(self, bench: GripperBench) -> None:
@@ -209,7 +209,7 @@ class GripperContract(Contract):
 
     @needs("lose")
     def test_a_lost_link_raises_at_every_call_except_close(self, bench: GripperBench) -> None:
-        _opened(bench)
+        _open_driver(bench)
         bench.lose()
         wait_lost(bench, lambda: bench.driver.read(bench.pass_time()))
         with pytest.raises(ConnectionLost):
@@ -221,7 +221,7 @@ class GripperContract(Contract):
 
     @needs("lose", "restore")
     def test_a_restored_link_can_be_opened_again(self, bench: GripperBench) -> None:
-        _opened(bench)
+        _open_driver(bench)
         bench.lose()
         wait_lost(bench, lambda: bench.driver.read(bench.pass_time()))
         bench.driver.close()

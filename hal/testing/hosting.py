@@ -50,7 +50,7 @@ class HostedRobot:
     def __init__(self, bench: RobotBench) -> None:
         self.bench = bench
         self._folder = TemporaryDirectory()
-        spec = _with_kinematics(bench.driver.spec, Path(self._folder.name))
+        spec = _add_kinematics(bench.driver.spec, Path(self._folder.name))
         clock = "real_time" if bench.real_time else "lock_step"
         host = _BenchHost(GroupSpec("bench", clock, 1.0 / bench.dt, (spec,)))
         with patch.object(registry, "load", lambda name, kind: lambda spec, world: bench.driver):
@@ -123,7 +123,7 @@ class HostedGripper:
         self.unit.close()
 
 
-def _with_kinematics(spec: RobotSpec, folder: Path) -> RobotSpec:
+def _add_kinematics(spec: RobotSpec, folder: Path) -> RobotSpec:
     """Return the spec, with a planar chain of 0.2 m links as its URDF if it names none."""
     if spec.kinematics.urdf:
         return spec

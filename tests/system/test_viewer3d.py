@@ -249,7 +249,7 @@ def test_stop_stops_the_arm_and_a_trip_ends_goals(rig: hal.Rig, viewer: ViserVie
 
 def test_edits_of_the_world_are_drawn(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
     def told(method: str, **params: object) -> None:
-        viewer.edited(method, params, int(rig._hosts[0].request(f"world.{method}", params)))
+        viewer.note_edit(method, params, int(rig._hosts[0].request(f"world.{method}", params)))
 
     cube = "/bodies/cube/0"
     until(lambda: page.hear() or np.abs(np.subtract(page.nodes[cube]["position"], (0.0, -0.2, 0.7))).max() < 0.1)

@@ -19,7 +19,7 @@ from hal.driver import Reading, Setpoint
 from hal.drivers.franka.limits import LIMITS
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec
-from hal_emulators.franka.motion import LimitChecker, MotionSample, at_rest, by_position, extrapolated
+from hal_emulators.franka.motion import LimitChecker, MotionSample, at_rest, extrapolate, step_position
 
 pytestmark = pytest.mark.slow
 
@@ -52,9 +52,9 @@ class Controller:
         before = self.sample
         if setpoint is None or lose:
             self.lost += 1
-            self.sample = extrapolated(before)
+            self.sample = extrapolate(before)
             return
-        self.sample = by_position(before, setpoint.q)
+        self.sample = step_position(before, setpoint.q)
         violation = self.checker.joints(before, self.sample)
         assert violation is None, f"cycle {self.cycles}: {violation.text if violation else ''}"
         self.travel += math.dist(before.q, self.sample.q)

@@ -74,7 +74,7 @@ def test_preflight() -> None:
 
 
 def test_no_camera_is_connected() -> None:
-    assert RealSenseCamera.plugged() == ()
+    assert RealSenseCamera.list_plugged() == ()
     assert registry.load("realsense", "camera") is RealSenseCamera
 
 

@@ -28,7 +28,7 @@ __all__ = [
     "observations",
     "picture_name",
     "camera_roles",
-    "with_channel",
+    "add_channel",
 ]
 
 
@@ -311,7 +311,7 @@ def picture_name(stream: PictureStream) -> str:
     return f"{stream.camera}_{'image' if stream.what == 'rgb' else stream.what}"
 
 
-def with_channel(picture: NDArray[Any]) -> NDArray[Any]:
+def add_channel(picture: NDArray[Any]) -> NDArray[Any]:
     """Return a picture with channels last: (H, W, 3), or (H, W, 1) for one without colours."""
     return picture if picture.ndim == 3 else picture[:, :, None]
 
@@ -345,7 +345,7 @@ def camera_roles(
             )
     if camera is not None and camera == gripper_camera:
         raise CommandError(f"{camera} cannot be both camera and gripper camera", code="duplicate_name")
-    carried = _carried(content)
+    carried = _find_carried(content)
     free = [name for name in there if name not in (camera, gripper_camera)]
     gripper_camera = gripper_camera or next((name for name in free if name in carried), None)
     camera = camera or next((name for name in free if name not in carried), None)
@@ -357,7 +357,7 @@ def camera_roles(
     return found
 
 
-def _carried(content: EpisodeContent) -> set[str]:
+def _find_carried(content: EpisodeContent) -> set[str]:
     """Return the cameras that an arm carries in the rig's configuration."""
     cameras = content.episode.info["rig"]["resolved"]["cameras"]
     return {spec["name"] for spec in cameras if (spec["view"] or {}).get("robot") is not None}

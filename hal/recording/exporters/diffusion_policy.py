@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .content import EpisodeContent, picture_name, with_channel
+from .content import EpisodeContent, add_channel, picture_name
 from .output import ExportJob
 
 __all__ = [
@@ -141,4 +141,4 @@ def _columns(
     job.numbers_done(content)
     for stream in content.pictures:
         shape = stream.shape if len(stream.shape) == 3 else (*stream.shape, 1)
-        yield picture_name(stream), stream.dtype, shape, map(with_channel, job.pictures(content, stream))
+        yield picture_name(stream), stream.dtype, shape, map(add_channel, job.pictures(content, stream))

@@ -138,7 +138,7 @@ def write_atomically(path: Path, *, force: bool, is_ours: Callable[[Path], bool]
     _check(path, force=force, is_ours=is_ours)
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path)
-    beside = _beside(path, "partial")
+    beside = _make_path_beside(path, "partial")
     try:
         yield beside
         _check(path, force=force, is_ours=is_ours)  # it may have come meanwhile
@@ -152,7 +152,7 @@ def _replace(path: Path, beside: Path) -> None:
     if not path.is_dir():
         beside.replace(path)
         return
-    old = _beside(path, "old")  # a folder that is not empty cannot be replaced at once
+    old = _make_path_beside(path, "old")  # a folder that is not empty cannot be replaced at once
     path.rename(old)
     try:
         beside.rename(path)
@@ -174,7 +174,7 @@ def _check(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> None:
         )
 
 
-def _beside(path: Path, what: str) -> Path:
+def _make_path_beside(path: Path, what: str) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.{what}")
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...errors import DriverMissing
 from .actions import action_dict
-from .content import EpisodeContent, PictureStream, picture_name, with_channel
+from .content import EpisodeContent, PictureStream, add_channel, picture_name
 from .output import ExportJob
 
 __all__ = ["is_export", "write"]
@@ -88,7 +88,7 @@ def _write_pictures(job: ExportJob, content: EpisodeContent, stream: PictureStre
         shuffle=stream.dtype.itemsize > 1,
     )
     for k, picture in enumerate(job.pictures(content, stream)):
-        pictures[k] = with_channel(picture)
+        pictures[k] = add_channel(picture)
     # The next picture is already in the file, one row further: a view of it instead of a copy.
     view = h5py.VirtualLayout(pictures.shape, pictures.dtype)
     source = h5py.VirtualSource(".", pictures.name, shape=pictures.shape, dtype=pictures.dtype)

@@ -57,7 +57,7 @@ def main(expected: int) -> None:
     models = tuple(yaml.safe_load(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.yaml")))
     system = System()
     pad = EvdevPad(PadSpec("pad", "evdev", None, models), system=system)
-    plugged = EvdevPad.plugged()
+    plugged = EvdevPad.list_plugged()
     pad.open()
     reading = pad.poll(time.monotonic(), 0.0)
     found = {"describe": pad.describe(), "plugged": plugged.pads, "notes": pad.notes, "flat": dict(pad.flat)}

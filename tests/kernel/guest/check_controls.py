@@ -19,7 +19,7 @@ def check_controls(kind: Kind, bench: Bench, pad: Gamepad, measured: Measured) -
     settle(bench, pad)
     assert pad.describe().startswith(kind.description)
     assert kernel_driver(node_of(pad)) == kind.driver
-    assert EvdevPad.plugged().devices == (node_of(pad),)
+    assert EvdevPad.list_plugged().devices == (node_of(pad),)
     assert not pad.notes
     slowest = 0.0
     for axes, buttons in kind.gestures():

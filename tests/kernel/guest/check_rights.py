@@ -29,8 +29,8 @@ def _unprivileged() -> Iterator[None]:
 def check_no_permission(bench: Bench, spec: PadSpec, measured: Measured) -> None:
     """The note names the command; the pad connects, and is trusted, when its devices may be read one by one."""
     bench.plug("dualshock4_bluetooth")
-    eventually(lambda: len(EvdevPad.plugged().pads) == 1, "the pad is there")
-    (node,) = EvdevPad.plugged().devices
+    eventually(lambda: len(EvdevPad.list_plugged().pads) == 1, "the pad is there")
+    (node,) = EvdevPad.list_plugged().devices
     others = [path for path in glob.glob("/dev/input/event*") if path != node]
     driver = EvdevPad(spec)
 
@@ -40,7 +40,7 @@ def check_no_permission(bench: Bench, spec: PadSpec, measured: Measured) -> None
 
     with _unprivileged():
         driver.open()
-        plugged = EvdevPad.plugged()
+        plugged = EvdevPad.list_plugged()
     try:
         assert not connected()
         for notes in (driver.notes, plugged.notes):

@@ -37,4 +37,4 @@ def check_no_pad(bench: Bench, pad: Gamepad) -> None:
     """The machine's keyboard is no pad."""
     assert not pad.state().connected
     assert pad.describe() == "no gamepad"
-    assert not EvdevPad.plugged().pads
+    assert not EvdevPad.list_plugged().pads

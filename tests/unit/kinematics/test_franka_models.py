@@ -104,12 +104,12 @@ def test_every_link_stands_where_that_of_pybullets_panda_does() -> None:
 
 @pytest.mark.parametrize("urdf", [URDF, PANDA])
 def test_pybullet_loads_it_without_messages(urdf: Path) -> None:
-    from hal.drivers.pybullet.engine import PyBulletClient, silenced
+    from hal.drivers.pybullet.engine import PyBulletClient, silence_output
     from hal.drivers.pybullet.loading import loadable_urdf
 
     data("")
     client = PyBulletClient()
-    with loadable_urdf(str(urdf)) as file, silenced() as chatter:
+    with loadable_urdf(str(urdf)) as file, silence_output() as chatter:
         body = client.loadURDF(file, useFixedBase=True, flags=client.URDF_USE_INERTIA_FROM_FILE)
     assert chatter.text == ""
     drawn = [Path(shape[4].decode()) for shape in client.getVisualShapeData(body)]

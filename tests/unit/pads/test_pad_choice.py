@@ -20,7 +20,7 @@ def plug(monkeypatch: pytest.MonkeyPatch):
     from hal.drivers.evdev.pad import EvdevPad
 
     def say(*pads: str, notes: tuple[str, ...] = ()) -> None:
-        monkeypatch.setattr(EvdevPad, "plugged", classmethod(lambda cls: Plugged(pads, notes)))
+        monkeypatch.setattr(EvdevPad, "list_plugged", classmethod(lambda cls: Plugged(pads, notes)))
 
     return say
 

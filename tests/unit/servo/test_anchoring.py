@@ -22,7 +22,7 @@ from hal.kinematics.arm import Kinematics
 from hal.servo.anchoring import LATEST
 from hal.servo.audit import SetpointAudit
 from hal.types import Limited, RobotStatus
-from hal_emulators.franka.motion import at_rest, by_position, extrapolated
+from hal_emulators.franka.motion import at_rest, extrapolate, step_position
 
 
 class Device:
@@ -114,7 +114,7 @@ def test_a_robot_is_followed_through_any_late_set_points_and_readings(lateness: 
         cycles = chance.randint(2, longest) if chance.random() < gap else 1
         for k in range(cycles):
             takes = k == 0 and sent is not None and chance.random() >= late
-            robot = by_position(robot, sent) if takes else extrapolated(robot)
+            robot = step_position(robot, sent) if takes else extrapolate(robot)
             commanded.append(robot.q)
             lost += not takes
         before, cycle = cycle, cycle + cycles

@@ -26,8 +26,8 @@ from hal.servo.controllers import (
     JointImpedance,
     OperationalSpace,
     controller_data,
+    replace_gains,
     resolve,
-    with_gains,
 )
 from hal.servo.torque_bounds import ArmInMotion, Inertia, TcpInMotion
 from hal.types import ControlMode, Limited, RobotStatus, Trip
@@ -158,7 +158,7 @@ def test_a_spring_of_the_orientation_is_no_longer_than_what_it_may_turn_the_tcp_
 
 def test_new_gains_take_effect_within_the_ramp() -> None:
     applied = Applied(JointImpedance(stiffness=100.0))
-    applied.law.set_gains(with_gains(applied.law.controller, {"stiffness": (20.0,) * N}))
+    applied.law.set_gains(replace_gains(applied.law.controller, {"stiffness": (20.0,) * N}))
     found = [applied.torques([0.01] * N)[0] for _ in range(round(RAMP / DT) + 2)]
     assert found[0] == pytest.approx(1.0, abs=0.01)
     assert found[-1] == pytest.approx(0.2)
@@ -178,7 +178,7 @@ def test_new_gains_take_effect_within_the_ramp() -> None:
 )
 def test_gains_out_of_range_are_refused(gains: dict[str, float]) -> None:
     with pytest.raises(CommandError):
-        with_gains(resolve(JointImpedance(), SPEC, KINEMATICS, 240.0), gains)
+        replace_gains(resolve(JointImpedance(), SPEC, KINEMATICS, 240.0), gains)
 
 
 @pytest.mark.parametrize("controller", [OperationalSpace(), JointImpedance()], ids=["task", "joints"])

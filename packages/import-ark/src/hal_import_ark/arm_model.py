@@ -43,7 +43,7 @@ class ArkUrdf:
         branches that it has merged in an order of its own.
         """
         if not merged:
-            return list(self._below(self.model.root))
+            return list(self._find_joints_below(self.model.root))
         chain: list[UrdfJoint] = []
         following = self._moving(self.model.root)
         while len(following) == 1:
@@ -51,11 +51,11 @@ class ArkUrdf:
             following = self._moving(following[0].child)
         return chain
 
-    def _below(self, link: str) -> Iterator[UrdfJoint]:
+    def _find_joints_below(self, link: str) -> Iterator[UrdfJoint]:
         for joint in self.model.joints.values():
             if joint.parent == link:
                 yield joint
-                yield from self._below(joint.child)
+                yield from self._find_joints_below(joint.child)
 
     def _moving(self, link: str) -> list[UrdfJoint]:
         """Return the next joints that are not fixed."""

@@ -106,9 +106,9 @@ class ImportState:
     def items(self, root: ArkNode, section: str) -> Iterator[ArkItem]:
         """Yield the entries of a section that can be read; problems of the others are noted."""
         with suppress(InvalidValue):
-            yield from self._listed(root, section, nested=False)
+            yield from self._list_items(root, section, nested=False)
 
-    def _listed(self, root: ArkNode, section: str, *, nested: bool) -> Iterator[ArkItem]:
+    def _list_items(self, root: ArkNode, section: str, *, nested: bool) -> Iterator[ArkItem]:
         listed = root.get(section)
         if listed is None:
             return
@@ -128,7 +128,7 @@ class ImportState:
             beside = listed.file.parent / entry  # where Ark looks
             item = self.reading.file((beside if beside.is_file() else self.places.find(entry) or beside).resolve())
             if section in item.children:  # so are the examples that come with Ark's drivers
-                yield from self._listed(item, section, nested=True)
+                yield from self._list_items(item, section, nested=True)
                 return
         elif isinstance(entry, dict) and node is not None:
             item = node

@@ -85,10 +85,10 @@ def _entry(key: str, value: Any, indent: int, folder: Path) -> list[str]:
     value = _bare(value)
     name = _scalar(key)
     if isinstance(value, Mapping) and value and not isinstance(value, Inline):
-        head = [_with_comment(f"{space}{name}:", comment)]
+        head = [_add_comment(f"{space}{name}:", comment)]
         return head + [line for k, item in value.items() for line in _entry(str(k), item, indent + 2, folder)]
     if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
-        lines = [_with_comment(f"{space}{name}:", comment)]
+        lines = [_add_comment(f"{space}{name}:", comment)]
         for item in value:
             inner = [line for k, part in item.items() for line in _entry(str(k), part, indent + 4, folder)]
             first = next(k for k, line in enumerate(inner) if not line.lstrip().startswith("#"))
@@ -99,14 +99,14 @@ def _entry(key: str, value: Any, indent: int, folder: Path) -> list[str]:
     line = f"{space}{name}: {_alone(written) if isinstance(written, str) else _flow(written)}"
     if comment and len(line) + len(comment) + 4 > _WIDTH:
         return [f"{space}# {comment}", line]
-    return [_with_comment(line, comment)]
+    return [_add_comment(line, comment)]
 
 
 def _bare(value: Any) -> Any:
     return value.value if isinstance(value, Commented) else value
 
 
-def _with_comment(line: str, comment: str) -> str:
+def _add_comment(line: str, comment: str) -> str:
     return f"{line}    # {comment}" if comment else line
 
 
@@ -189,14 +189,14 @@ class KeyReport:
         order: dict[Path, int] = {}
         for root in files:
             order[root.file] = len(order)
-            for node in self._unseen(root):
+            for node in self._find_unseen(root):
                 if node.data in (None, {}, []):
                     self.ignored(node, "is empty")
                 else:
                     self._add(node, "unknown", "", "nothing here reads it")
         return tuple(sorted(self._rows, key=lambda row: (order.get(row.node.file, 0), row.node.line)))
 
-    def _unseen(self, node: ArkNode) -> Iterator[ArkNode]:
+    def _find_unseen(self, node: ArkNode) -> Iterator[ArkNode]:
         if id(node) in self._seen:
             return
         if not node.children:
@@ -204,7 +204,7 @@ class KeyReport:
                 yield node
             return
         for child in node.children.values():
-            yield from self._unseen(child)
+            yield from self._find_unseen(child)
 
     def origin(self, key: str) -> ArkNode | None:
         """Return Ark's key that a key of the rig came from; else the first one that a key below it came from."""

@@ -73,7 +73,7 @@ def test_machine_without_input_devices_has_no_pad(tmp_path: Path) -> None:
     nothing = LinuxInput(tmp_path / "none", tmp_path / "none")
     assert nothing.nodes() == []
     assert nothing.fingerprint() == ()
-    assert isinstance(EvdevPad.plugged().pads, tuple)
+    assert isinstance(EvdevPad.list_plugged().pads, tuple)
 
 
 def put_device(root: Path, number: int, keys: str = "0", axes: str = "0", rels: str = "0", **ids: str) -> None:

@@ -17,9 +17,9 @@ from hal_emulators.franka.motion import (
     Violation,
     at_rest,
     braked,
-    by_position,
-    by_velocity,
-    extrapolated,
+    extrapolate,
+    step_position,
+    step_velocity,
 )
 
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
@@ -86,7 +86,7 @@ def after(before: MotionSample, acceleration: float, joint: int = 0) -> MotionSa
     """The next sample, with that acceleration in one joint."""
     dq = list(before.dq)
     dq[joint] += acceleration * DT
-    return by_velocity(before, dq)
+    return step_velocity(before, dq)
 
 
 def name(violation: Violation | None) -> str:
@@ -134,7 +134,7 @@ def test_the_fr3s_speed_depends_on_where_the_joint_is_and_the_pandas_does_not() 
 
 def test_a_violation_has_joint_value_and_limit() -> None:
     before = at_rest(HOME)
-    jumped = by_position(before, [HOME[0], HOME[1], HOME[2] + 0.05, *HOME[3:]])
+    jumped = step_position(before, [HOME[0], HOME[1], HOME[2] + 0.05, *HOME[3:]])
     violation = LimitChecker(FR3).joints(before, jumped)
     assert name(violation) == "joint_motion_generator_velocity_limits_violation"
     assert violation.text == "joint 3: velocity 50 rad/s, limit 2.62 rad/s"
@@ -167,7 +167,7 @@ def test_it_keeps_how_near_to_each_limit_a_motion_came() -> None:
     sample, way, duration = at_rest(HOME), 0.5, 1.0
     for k in range(1, 1001):
         moved = way * (1.0 - cos(pi * k * DT / duration)) / 2.0
-        following = by_position(sample, [HOME[0] + moved, *HOME[1:]])
+        following = step_position(sample, [HOME[0] + moved, *HOME[1:]])
         assert checker.joints(sample, following) is None
         sample = following
     report = checker.report()
@@ -182,7 +182,7 @@ def test_it_keeps_how_near_to_each_limit_a_motion_came() -> None:
 def test_after_a_lost_command_the_acceleration_stays() -> None:
     sample = moving(0.5, 2.0)
     for k in range(1, 4):
-        sample = extrapolated(sample)
+        sample = extrapolate(sample)
         assert (sample.dq[0], sample.ddq[0]) == (pytest.approx(0.5 + 0.002 * k), 2.0)
     assert sample.q[0] == pytest.approx(HOME[0] + DT * (0.502 + 0.504 + 0.506))
 
@@ -194,7 +194,7 @@ def test_going_on_after_losses_multiplies_the_jerk_that_is_seen(lost: int, times
     sample, worst = at_rest((0.0,) * 7), 0.0
     for k, position in enumerate(wanted[1:], 1):
         came = not 10 < k <= 10 + lost
-        following = by_position(sample, [position] + [0.0] * 6) if came else extrapolated(sample)
+        following = step_position(sample, [position] + [0.0] * 6) if came else extrapolate(sample)
         worst = max(worst, abs(following.ddq[0] - sample.ddq[0]) / DT)
         sample = following
     assert worst == pytest.approx(times, abs=1.0)

@@ -88,11 +88,11 @@ def test_the_window_shows_the_world_and_its_edits_until_it_is_closed(display: Di
             edit = {"spec": to_json(ball)}
             revision = host.request("world.add", edit)
             host.advance_to(host.now() + 0.1)
-            viewer.edited("add", edit, revision)
+            viewer.note_edit("add", edit, revision)
             wait_until(picture_changed)
         display.server.terminate()
         wait_until(lambda: viewer._child.process.poll() is not None)
-        viewer.edited("set_color", {"name": "block", "rgba": [1, 0, 0, 1]}, 4)  # not an error
+        viewer.note_edit("set_color", {"name": "block", "rgba": [1, 0, 0, 1]}, 4)  # not an error
     finally:
         viewer.close()
         viewer.close()

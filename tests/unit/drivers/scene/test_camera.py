@@ -141,9 +141,9 @@ class TestWorker:
         add = bench.edit("add", spec=to_json(ball("second", 0.3, rgba=(1.0, 0.0, 0.0, 1.0))))
         paint = bench.edit("set_color", name="second", rgba=[0.0, 0.0, 1.0, 1.0])
         assert bench.next_frame() is None  # the snapshot overtook the edits
-        bench.mirror.edited(*paint)  # and these overtook each other
+        bench.mirror.note_edit(*paint)  # and these overtook each other
         assert bench.drawn() is None
-        bench.mirror.edited(*add)
+        bench.mirror.note_edit(*add)
         frame = bench.drawn()
         seen = frame.segmentation == 2
         assert seen.sum() > 20
@@ -153,7 +153,7 @@ class TestWorker:
     def test_an_edit_waits_for_its_snapshot(self, bench: Bench) -> None:
         bench.publish()
         remove = bench.edit("remove", name="ball")
-        bench.mirror.edited(*remove)
+        bench.mirror.note_edit(*remove)
         frame = bench.drawn()  # the snapshot still has the ball
         assert 1 in np.unique(frame.segmentation)
         frame = bench.next_frame()
@@ -251,7 +251,7 @@ def test_renderer_process_draws_follows_edits_and_reports_its_end() -> None:
             assert again.seq > frame.seq
 
         paint = {"name": "block", "rgba": [0.0, 0.0, 1.0, 1.0]}
-        pictures.edited("set_color", paint, host.request("world.set_color", paint))
+        pictures.note_edit("set_color", paint, host.request("world.set_color", paint))
         blue = newest(drivers[0], time.monotonic())
         red, _, strong = blue.color[blue.segmentation == 1].mean(axis=0)
         assert strong > red + 50

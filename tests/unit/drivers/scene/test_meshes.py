@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pictures_kit import COLLADA
 
-from hal.drivers.scene.meshes import MeshLibrary, cache_folder, parse, simplified
+from hal.drivers.scene.meshes import MeshLibrary, cache_folder, parse, simplify_mesh
 from hal.drivers.scene.shapes import Mesh, box, capsule, cylinder, sphere
 
 CUBE = """\
@@ -188,7 +188,7 @@ def test_a_heavy_mesh_gets_lighter_and_keeps_its_shape() -> None:
     quads = np.stack([first, first + 60, first + 61, first, first + 61, first + 1], axis=1)
     faces = quads.reshape(-1, 3).astype(np.uint32)
     heavy = Mesh(positions, np.zeros_like(positions), np.zeros((3600, 4), np.uint8), faces)
-    light = simplified(heavy)
+    light = simplify_mesh(heavy)
     assert len(light.faces) < 0.5 * len(heavy.faces)
     used = light.positions[light.faces].reshape(-1, 3)
     assert (used.min(axis=0) == positions.min(axis=0)).all()
@@ -196,4 +196,4 @@ def test_a_heavy_mesh_gets_lighter_and_keeps_its_shape() -> None:
     middle = light.positions[light.faces].mean(axis=1)
     truth = np.where(middle[:, 0] > 0, np.sqrt(4 - np.maximum(middle[:, 0], 0) ** 2), 2.0)
     assert np.abs(middle[:, 2] - truth).max() < 2e-3  # of a diagonal of 2.8
-    assert simplified(light) is light
+    assert simplify_mesh(light) is light

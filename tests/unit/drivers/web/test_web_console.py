@@ -18,7 +18,7 @@ from web_kit import camera, frame
 
 from hal.driver import GripperReading, Reading
 from hal.drivers.web.console import recording_message
-from hal.drivers.web.pictures import PictureCredit, compress, smoothed
+from hal.drivers.web.pictures import PictureCredit, compress, smooth_picture
 from hal.drivers.web.process import LogLimit
 from hal.drivers.web.server import keys_module, read_page_files
 from hal.drivers.web.telemetry import Telemetry
@@ -237,7 +237,7 @@ def test_a_small_picture_has_no_staircases_and_no_lone_pixels_and_is_not_changed
     picture = np.where((row > 0.3 * column + 10)[:, :, None], 200, 60).astype(np.uint8).repeat(3, axis=2)
     picture[5, 60] = 255
     before = picture.copy()
-    found = smoothed(picture)
+    found = smooth_picture(picture)
     assert (picture == before).all(), "what others get of this frame stays as it is"
     steps = np.unique(found[:, 20:60, 0])
     assert len(steps) > 6, "an edge passes through values in between"
@@ -252,5 +252,5 @@ def test_a_small_picture_has_no_staircases_and_no_lone_pixels_and_is_not_changed
 @pytest.mark.parametrize("shape", [(1, 1), (2, 5), (3, 3), (48, 64)])
 def test_any_size_and_any_noise_can_be_smoothed(shape: tuple[int, int]) -> None:
     noise = np.random.default_rng(1).integers(0, 256, (*shape, 3), np.uint8)
-    found = smoothed(noise)
+    found = smooth_picture(noise)
     assert (found.shape, found.dtype) == (noise.shape, noise.dtype)

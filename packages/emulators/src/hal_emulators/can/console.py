@@ -82,7 +82,7 @@ def _motor(target: _Target, word: str, other: str = "") -> int:
     return number
 
 
-def _until(word: str) -> float:
+def _parse_end(word: str) -> float:
     """Return the time at which a fault ends, s on the monotonic clock."""
     if word in ("on", "off"):
         return time.monotonic() + _FOREVER if word == "on" else 0.0
@@ -123,11 +123,11 @@ def _double(target: _Target, words: list[str]) -> None:
 
 def _silent(target: _Target, words: list[str]) -> None:
     number = 0 if words[0] == "all" else _motor(target, words[0], "or all")
-    target.bus.faults[target.arm.name].silent_until[number] = _until(words[1])
+    target.bus.faults[target.arm.name].silent_until[number] = _parse_end(words[1])
 
 
 def _cut(target: _Target, words: list[str]) -> None:
-    target.bus.cut_until = _until(words[0])
+    target.bus.cut_until = _parse_end(words[0])
 
 
 def _frame(target: _Target, words: list[str]) -> None:

@@ -225,12 +225,12 @@ class EmulatedArm:
     def user_stop(self, on: bool) -> None:
         """Press or release the user stop."""
         self.stops.user = on
-        self._stopped(on, "user stop")
+        self._set_stop(on, "user stop")
 
     def emergency_stop(self, on: bool) -> None:
         """Press or release the emergency stop. That the arm is idle once it is released is an assumption."""
         self.stops.emergency = on
-        self._stopped(on, "emergency stop")
+        self._set_stop(on, "emergency stop")
 
     def spoil(self, name: str, value: float | None) -> None:
         """Report ``value`` as the first number of a field of the state; None for the true one. Raises ValueError."""
@@ -250,7 +250,7 @@ class EmulatedArm:
             self.errors = frozenset()
         self.journal.record("guiding", f"guiding {'on' if on else 'off'}")
 
-    def _stopped(self, on: bool, what: str) -> None:
+    def _set_stop(self, on: bool, what: str) -> None:
         self.journal.record(what, f"{what} {'pressed' if on else 'released'}")
         if on and self.motion is not None:
             self._end(Ending(RequestOutcome.EMERGENCY, what))

@@ -30,9 +30,9 @@ __all__ = [
     "Violation",
     "at_rest",
     "braked",
-    "by_position",
-    "by_velocity",
-    "extrapolated",
+    "step_position",
+    "step_velocity",
+    "extrapolate",
     "read_move",
 ]
 
@@ -62,21 +62,21 @@ def at_rest(q: Floats) -> MotionSample:
     return MotionSample(q, (0.0,) * 7, (0.0,) * 7)
 
 
-def by_position(before: MotionSample, q: Floats) -> MotionSample:
+def step_position(before: MotionSample, q: Floats) -> MotionSample:
     """Return the sample after ``before`` for a commanded position ``q`` (7,), rad."""
     dq = [(new - old) / DT for new, old in zip(q, before.q, strict=True)]
     ddq = [(new - old) / DT for new, old in zip(dq, before.dq, strict=True)]
     return MotionSample(q, dq, ddq)
 
 
-def by_velocity(before: MotionSample, dq: Floats) -> MotionSample:
+def step_velocity(before: MotionSample, dq: Floats) -> MotionSample:
     """Return the sample after ``before`` for a commanded velocity ``dq`` (7,), rad/s."""
     q = [old + new * DT for old, new in zip(before.q, dq, strict=True)]
     ddq = [(new - old) / DT for new, old in zip(dq, before.dq, strict=True)]
     return MotionSample(q, dq, ddq)
 
 
-def extrapolated(before: MotionSample) -> MotionSample:
+def extrapolate(before: MotionSample) -> MotionSample:
     """Return the sample after ``before`` for a lost command: it keeps the acceleration."""
     dq = [v + a * DT for v, a in zip(before.dq, before.ddq, strict=True)]
     q = [p + v * DT for p, v in zip(before.q, dq, strict=True)]
@@ -91,7 +91,7 @@ def braked(before: MotionSample, deceleration: Floats) -> MotionSample:
         0.0 if abs(v) <= a * DT else v - a * DT if v > 0.0 else v + a * DT
         for v, a in zip(before.dq, deceleration, strict=True)
     ]
-    return by_velocity(before, dq)
+    return step_velocity(before, dq)
 
 
 # Limits.
@@ -188,7 +188,7 @@ class LimitChecker:
         """Compare the first commanded position with the arm's position, both (7,), rad."""
         allowed = self.tolerances.start_pose
         for k, (measured, commanded) in enumerate(zip(q, q_commanded, strict=True)):
-            if self._over("start_pose", k, commanded - measured, allowed, 0.0):
+            if self._is_over("start_pose", k, commanded - measured, allowed, 0.0):
                 return self._violation(
                     _START, "start_pose", k, "first position is off by", commanded - measured, allowed
                 )
@@ -199,21 +199,21 @@ class LimitChecker:
         limits, tolerances = self.limits, self.tolerances
         for k, position in enumerate(after.q):
             middle = 0.5 * (limits.lower[k] + limits.upper[k])
-            if self._over("position", k, position - middle, limits.upper[k] - middle, 0.0):
+            if self._is_over("position", k, position - middle, limits.upper[k] - middle, 0.0):
                 bound = limits.lower[k] if position < middle else limits.upper[k]
                 return self._violation(_POSITION, "position", k, "position", position, bound)
         lowest, highest = limits.velocity_range(before.q)
         for k, velocity in enumerate(after.dq):
             allowed = highest[k] if velocity > 0.0 else -lowest[k]
-            if self._over("velocity", k, velocity, allowed, tolerances.velocity):
+            if self._is_over("velocity", k, velocity, allowed, tolerances.velocity):
                 return self._violation(_VELOCITY, "velocity", k, "velocity", velocity, allowed)
         for k, acceleration in enumerate(after.ddq):
             allowed = limits.acceleration[k]
-            if self._over("acceleration", k, acceleration, allowed, tolerances.acceleration):
+            if self._is_over("acceleration", k, acceleration, allowed, tolerances.acceleration):
                 return self._violation(_ACCELERATION, "acceleration", k, "acceleration", acceleration, allowed)
         for k, (new, old) in enumerate(zip(after.ddq, before.ddq, strict=True)):
             allowed = limits.jerk[k]
-            if self._over("jerk", k, (new - old) / DT, allowed, tolerances.jerk * allowed):
+            if self._is_over("jerk", k, (new - old) / DT, allowed, tolerances.jerk * allowed):
                 return self._violation(_JERK, "jerk", k, "jerk", (new - old) / DT, allowed)
         return None
 
@@ -221,10 +221,10 @@ class LimitChecker:
         """Check commanded torques (7,), Nm, and their rate. The documentation only recommends the range."""
         limits, tolerances = self.limits, self.tolerances
         for k, (new, old) in enumerate(zip(after, before, strict=True)):
-            if self._over("torque", k, new, limits.torque[k], tolerances.torque):
+            if self._is_over("torque", k, new, limits.torque[k], tolerances.torque):
                 return self._violation(_TORQUE, "torque", k, "torque", new, limits.torque[k])
             rate = (new - old) / DT
-            if self._over("torque_rate", k, rate, limits.torque_rate[k], tolerances.torque_rate):
+            if self._is_over("torque_rate", k, rate, limits.torque_rate[k], tolerances.torque_rate):
                 return self._violation(_TORQUE_RATE, "torque_rate", k, "torque changes by", rate, limits.torque_rate[k])
         return None
 
@@ -241,7 +241,7 @@ class LimitChecker:
                 )
         return None
 
-    def _over(self, name: str, joint: int, value: float, allowed: float, tolerance: float) -> bool:
+    def _is_over(self, name: str, joint: int, value: float, allowed: float, tolerance: float) -> bool:
         share = abs(value) / (allowed + tolerance)
         worst = self.worst[name]
         if share > worst.share:
@@ -386,9 +386,9 @@ class EmulatedMotion:
                 violation = self._checker.start(q, command.q)
                 if violation is not None:
                     return violation
-            sample = by_position(self.sample, command.q)
+            sample = step_position(self.sample, command.q)
         else:
-            sample = by_velocity(self.sample, command.dq)
+            sample = step_velocity(self.sample, command.dq)
         violation = self._checker.joints(self.sample, sample)
         if violation is None:
             self.sample = sample
@@ -401,7 +401,7 @@ class EmulatedMotion:
             text = f"{self.lost_in_row} commands in a row were lost"
             return Ending(RequestOutcome.REFLEX, text, _COMMUNICATION)
         if self.options.generator is not Generator.NONE:
-            self.sample = extrapolated(self.sample)
+            self.sample = extrapolate(self.sample)
         return None
 
     def _chase(self) -> None:
@@ -412,7 +412,7 @@ class EmulatedMotion:
             speed = min(self.options.speeds[k], _APPROACH * abs(way), sqrt(most * abs(way)))
             change = copysign(speed, way) - self.sample.dq[k]
             speeds.append(self.sample.dq[k] + max(-most * DT, min(most * DT, change)))
-        self.sample = by_velocity(self.sample, speeds)
+        self.sample = step_velocity(self.sample, speeds)
 
     def _count(self, success: int) -> None:
         self._successes += success - self._in_time[0]

@@ -30,7 +30,7 @@ __all__ = [
     "RigidBody",
     "arm_only",
     "multiply",
-    "without_shapes",
+    "remove_shapes",
 ]
 
 Pose16 = tuple[float, ...]
@@ -59,7 +59,7 @@ class RigidBody:
     def __init__(self, urdf: Path) -> None:
         """Raises ValueError if the URDF cannot be read, or lacks the seven joints or the flange."""
         model = pin.buildModelFromUrdf(str(urdf))
-        names = [_named(model, f"joint{k}") for k in range(1, 8)]
+        names = [_find_name(model, f"joint{k}") for k in range(1, 8)]
         others = [k for k in range(1, model.njoints) if model.names[k] not in names]
         reference = pin.neutral(model)
         for k in others:
@@ -111,7 +111,7 @@ class RigidBody:
         return after
 
 
-def _named(model: Any, ending: str) -> str:
+def _find_name(model: Any, ending: str) -> str:
     found = [str(name) for name in model.names if str(name).endswith(ending) and "finger" not in str(name)]
     if len(found) != 1:
         raise ValueError(f"the URDF has {len(found)} joints whose name ends in {ending!r}, not one")
@@ -231,7 +231,7 @@ class PyBulletPlant(Plant):
     def _load(self, urdf: Path) -> int:
         bullet = self._bullet
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as bare:
-            bare.write(without_shapes(urdf.read_text(encoding="utf-8")))
+            bare.write(remove_shapes(urdf.read_text(encoding="utf-8")))
             bare.flush()
             try:
                 arm: int = bullet.loadURDF(bare.name, useFixedBase=True, flags=bullet.URDF_USE_INERTIA_FROM_FILE)
@@ -278,9 +278,9 @@ class PyBulletPlant(Plant):
 _PREFIX = re.compile(r"^.*_(?=(link|joint)\d$)")
 
 
-def without_shapes(urdf: str) -> str:
+def remove_shapes(urdf: str) -> str:
     """Return a URDF without visual and collision shapes. Raises ValueError if it is not valid XML."""
-    root = _parsed(urdf)
+    root = _parse_urdf(urdf)
     for link in root.findall("link"):
         for name in ("visual", "collision"):
             for shape in link.findall(name):
@@ -297,7 +297,7 @@ def arm_only(urdf: str) -> str:
     Raises:
         ValueError: Without a link whose name ends in ``link8``.
     """
-    root = _parsed(without_shapes(urdf))
+    root = _parse_urdf(remove_shapes(urdf))
     joints = {_end(joint, "child"): joint for joint in root.findall("joint")}
     link = next((name for name in joints if name.endswith("link8")), None)
     if link is None:
@@ -319,7 +319,7 @@ def arm_only(urdf: str) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _parsed(urdf: str) -> ElementTree.Element:
+def _parse_urdf(urdf: str) -> ElementTree.Element:
     try:
         return ElementTree.fromstring(urdf)
     except ElementTree.ParseError as error:

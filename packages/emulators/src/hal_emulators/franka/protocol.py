@@ -128,7 +128,7 @@ _CONNECT = {RequestOutcome.SUCCESS: 0, RequestOutcome.NOT_POSSIBLE: 1}
 _MODEL = _YES_NO | {RequestOutcome.INVALID: 1}
 
 
-def _numbered(first: int, *outcomes: RequestOutcome) -> dict[RequestOutcome, int]:
+def _number_outcomes(first: int, *outcomes: RequestOutcome) -> dict[RequestOutcome, int]:
     return {outcome: first + k for k, outcome in enumerate(outcomes)}
 
 
@@ -140,16 +140,16 @@ _MOVE = (
     RequestOutcome.INPUT_ERROR,
     RequestOutcome.ABORTED,
 )
-_MOVE_BEGUN = _numbered(0, RequestOutcome.SUCCESS, RequestOutcome.STARTED, RequestOutcome.PREEMPTED)
+_MOVE_BEGUN = _number_outcomes(0, RequestOutcome.SUCCESS, RequestOutcome.STARTED, RequestOutcome.PREEMPTED)
 # "Start at a singular pose" is between "not possible" and "invalid argument"; the emulator never sends it.
-_MOVE_5 = _MOVE_BEGUN | {RequestOutcome.NOT_POSSIBLE: 3} | _numbered(5, *_MOVE[1:])
-_MOVE_10 = _MOVE_BEGUN | {RequestOutcome.NOT_POSSIBLE: 5} | _numbered(7, *_MOVE[1:])
-_STOP_5 = _YES_NO | _numbered(2, RequestOutcome.EMERGENCY, RequestOutcome.REFLEX, RequestOutcome.ABORTED)
-_STOP_10 = _YES_NO | _numbered(3, RequestOutcome.EMERGENCY, RequestOutcome.REFLEX, RequestOutcome.ABORTED)
-_RECOVERY_5 = _YES_NO | _numbered(
+_MOVE_5 = _MOVE_BEGUN | {RequestOutcome.NOT_POSSIBLE: 3} | _number_outcomes(5, *_MOVE[1:])
+_MOVE_10 = _MOVE_BEGUN | {RequestOutcome.NOT_POSSIBLE: 5} | _number_outcomes(7, *_MOVE[1:])
+_STOP_5 = _YES_NO | _number_outcomes(2, RequestOutcome.EMERGENCY, RequestOutcome.REFLEX, RequestOutcome.ABORTED)
+_STOP_10 = _YES_NO | _number_outcomes(3, RequestOutcome.EMERGENCY, RequestOutcome.REFLEX, RequestOutcome.ABORTED)
+_RECOVERY_5 = _YES_NO | _number_outcomes(
     2, RequestOutcome.MANUAL, RequestOutcome.REFLEX, RequestOutcome.EMERGENCY, RequestOutcome.ABORTED
 )
-_RECOVERY_10 = _YES_NO | _numbered(
+_RECOVERY_10 = _YES_NO | _number_outcomes(
     3, RequestOutcome.MANUAL, RequestOutcome.REFLEX, RequestOutcome.EMERGENCY, RequestOutcome.ABORTED
 )
 

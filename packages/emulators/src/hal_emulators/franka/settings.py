@@ -101,7 +101,7 @@ def _thresholds(parts: dict[str, Values]) -> str | None:
     return None
 
 
-def _within(name: str, ranges: Sequence[tuple[float, float]]) -> Callable[[dict[str, Values]], str | None]:
+def _check_ranges(name: str, ranges: Sequence[tuple[float, float]]) -> Callable[[dict[str, Values]], str | None]:
     def check(parts: dict[str, Values]) -> str | None:
         for k, (value, (least, most)) in enumerate(zip(parts[name], ranges, strict=True)):
             if not least <= value <= most:
@@ -148,11 +148,11 @@ def _anything(parts: dict[str, Values]) -> str | None:
 
 _CHECKS: dict[str, Callable[[dict[str, Values]], str | None]] = {
     "SetCollisionBehavior": _thresholds,
-    "SetJointImpedance": _within("K_theta", [(0.0, 14250.0)] * 7),
-    "SetCartesianImpedance": _within("K_x", [(10.0, 3000.0)] * 3 + [(1.0, 300.0)] * 3),
+    "SetJointImpedance": _check_ranges("K_theta", [(0.0, 14250.0)] * 7),
+    "SetCartesianImpedance": _check_ranges("K_x", [(10.0, 3000.0)] * 3 + [(1.0, 300.0)] * 3),
     "SetGuidingMode": _anything,
     "SetEEToK": _rigid("EE_T_K"),
     "SetNEToEE": _rigid("NE_T_EE"),
     "SetLoad": _load,
-    "SetFilters": _within("frequencies", [(0.0, 1000.0)] * 5),
+    "SetFilters": _check_ranges("frequencies", [(0.0, 1000.0)] * 5),
 }
