@@ -117,7 +117,7 @@ class Driven(HandTicked):
     def until_held(self, most: float = 1.0) -> float:
         """Tick until positions hold the arm; returns how long that took, s."""
         begun = self.now
-        while self.by_torques or not self.servo._at_rest():
+        while self.by_torques or not self.servo._is_at_rest():
             self.tick()
             assert self.now < begun + most, "positions did not take over"
         return self.now - begun

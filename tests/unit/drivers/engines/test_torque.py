@@ -144,7 +144,7 @@ class TestServed:
                 if rng.random() < 0.2:
                     arm.stops += 1
             arm.drive(arm.dt, tau)
-            if arm.servo._at_rest() and arm.servo.report.trip:
+            if arm.servo._is_at_rest() and arm.servo.report.trip:
                 arm.rearm()
             assert (arm.q <= limits.upper).all()
             assert (arm.q >= limits.lower).all()
