@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from hal import registry
 from hal.apps._display import list_devices
@@ -421,10 +421,17 @@ def interruptible() -> Iterator[None]:
             signal.signal(getattr(signal, name), handler)
 
 
-def program(parser: Callable[[], argparse.ArgumentParser]) -> Callable[[Callable[[Any], int]], Callable[..., int]]:
+class Program(Protocol):
+    """The function of a program: of the command line, or None for that of the process, to the exit status."""
+
+    def __call__(self, argv: list[str] | None = None) -> int:
+        """Run the program."""
+
+
+def program(parser: Callable[[], argparse.ArgumentParser]) -> Callable[[Callable[[Any], int]], Program]:
     """Make a function of the parsed options one of the command line, without arguments of that of the process."""
 
-    def decorate(main: Callable[[Any], int]) -> Callable[..., int]:
+    def decorate(main: Callable[[Any], int]) -> Program:
         @wraps(main)
         def run(argv: list[str] | None = None) -> int:
             return run_app(main, parser(), argv)

@@ -163,7 +163,7 @@ def summarise(found: list[Try]) -> str:
 
 def run(quick: bool) -> Iterator[Table]:
     """Yield the table."""
-    tries = 1 if quick else 100
+    tries = 1 if quick else 30
     columns = ("", "succeed; others", "width, mm: median, least, greatest", "off the goal, mm: median, greatest")
     table = Table(f"pick and place, {tries} tries each, engine {ENGINES[0]}", columns)
     for name, bench in list(BENCHES.items())[: 1 if quick else 3]:

@@ -56,7 +56,7 @@ def test_pyright_knows_the_types_of_what_is_installed(environment: Path, tmp_pat
     assert len(revealed) == 4
     assert "NDArray[float64]" in revealed[0] or "ndarray" in revealed[0]
     assert "ndarray" in revealed[1] or "NDArray" in revealed[1]
-    assert "list[str] | None" in revealed[2]
+    assert "Program" in revealed[2]
     assert "DriverSpec" in revealed[3]
     (only,) = errors
     assert 'Cannot access attribute "move_home"' in only
