@@ -1,7 +1,7 @@
 """Pick and place on emulated arms in a shared world, beside the same seeds in simulation.
 
 A cube is put somewhere before the arm, grasped, lifted, carried to another place and put down there. A try succeeds if
-the grasp does, the cube is up before it is carried, and it ends within 10 mm of where it was to be put down. Simulation
+the grasp does, the cube is up before it is carried, and it ends within 3 mm of where it was to be put down. Simulation
 is in lock-step; an emulated arm moves in real time, behind the vendor's library or on an emulated bus.
 """
 
@@ -27,7 +27,7 @@ PATHS = (
     "hal/skills",
 )
 LIFT = 0.05
-NEAR = 0.01
+NEAR = 0.003
 """Distance from where the cube was to be put down up to which it is there, m."""
 CAMERA = {
     "sim": True,

@@ -114,7 +114,7 @@ def test_an_episode_of_pick_and_place_is_recorded_and_replayed(fr3: Bench, tmp_p
     shown = run_here(replay, str(tmp_path / "data"), "--unattended", *fr3.words)
     assert shown.returncode == 0, shown.stdout + shown.stderr
     with fr3.open() as rig:  # the emulator's world goes on between programs
-        assert rig.world.pose("cube").position == pytest.approx(put, abs=tries.NEAR)
+        assert rig.world.pose("cube").position == pytest.approx(put, abs=0.01)
 
 
 def miss_and_lose(rig: hal.Rig) -> None:
