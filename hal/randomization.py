@@ -19,7 +19,7 @@ import numpy as np
 from .arguments import integer
 from .errors import CommandError
 from .geometry import Pose
-from .specs import BodySpec, CameraSpec, RandomizeSpec, ViewSpec, WorldSpec
+from .specs import BodySpec, CameraSpec, RandomizeSpec, VariationSpec, ViewSpec, WorldSpec
 
 __all__ = [
     "COUNT",
@@ -122,6 +122,8 @@ class Randomizer:
         self._spec = spec.randomize if spec is not None else None
         self._undo: list[tuple[str, str, dict[str, Any]]] = []
         self._added: list[str] = []
+        self.clean = True
+        """Whether the world is as in the rig file; not after an attempt that failed midway, either."""
         self.record: dict[str, Any] | None = None
         """``seed`` and ``values`` of what is applied; None if the world is as in the rig file."""
 
@@ -137,11 +139,24 @@ class Randomizer:
             raise CommandError("a record of a randomization has the keys seed and values", code="bad_record")
         known = {variation.key: variation for variation in self._spec.variations}
         for key, value in given["values"].items():
-            if key not in known or (known[key].choices and value not in known[key].choices):
+            if key not in known or not self._can_be_drawn(known[key], value):
                 text = f"the record has {key} = {value!r}, which simulation.randomize of this rig does not draw"
                 raise CommandError(text, code="bad_record")
         copied: dict[str, Any] = json.loads(json.dumps(dict(given)))
         return copied | {"seed": integer("seed", copied["seed"], least=0)}
+
+    def _can_be_drawn(self, variation: VariationSpec, value: Any) -> bool:
+        """Return whether a value is one of the choices, or within the range."""
+        if variation.choices:
+            return value in variation.choices
+        if variation.key == DISTRACTORS:
+            assert self._spec is not None
+            return isinstance(value, list) and {body.name for body in self._spec.distractors}.issuperset(value)
+        numbers = value if isinstance(value, list) else [value]
+        return len(numbers) == len(variation.lower) and all(
+            isinstance(number, int | float) and low <= number <= high
+            for number, low, high in zip(numbers, variation.lower, variation.upper, strict=True)
+        )
 
     def apply(self, world: VariedWorld, record: dict[str, Any] | None) -> dict[str, Any]:
         """Restore the dynamics and objects of the rig file, then apply those of ``record``.
@@ -149,6 +164,7 @@ class Randomizer:
         Returns:
             The parameters of the edit that does the rest: light, colours, cameras, latencies and noise.
         """
+        self.clean = False
         there = world.bodies
         for name, link, values in reversed(self._undo):
             if name in there:
@@ -171,7 +187,6 @@ class Randomizer:
                 if name in there:
                     links: Iterable[str] = (place.removeprefix("links."),) if place else world.links(name)
                     self._scale(world, name, links, _SCALED[what], value)
-        self.record = record
         return {"values": dict(values), "seed": 0 if record is None else record["seed"]}
 
     def _scale(self, world: VariedWorld, name: str, links: Iterable[str], quantity: str, factor: float) -> None:

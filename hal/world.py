@@ -193,8 +193,9 @@ class World:
         """
         randomizer = self._randomizer
         record = None if seed is None else randomizer.make_record(seed)
-        if record is not None or randomizer.record is not None:
+        if record is not None or not randomizer.clean:
             self._edit("randomize", **randomizer.apply(self, record))
+            randomizer.record, randomizer.clean = record, record is None
         return self.randomization
 
     @property

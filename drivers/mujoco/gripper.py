@@ -28,12 +28,12 @@ class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
     def handle_fingers(self, active: bool) -> None:
         self.scene.handle(self.body.name, active)
 
-    def drive_fingers(self, speed: float) -> None:
+    def drive_fingers(self, width: float, force: float, speed: float) -> None:
         motors, at, travel = self.scene.motors, self._at, self.travel
-        width = self.read_width()[0]
-        targets, speeds = travel.positions(self._target), travel.speeds(speed, width)
+        present = self.read_width()[0]
+        targets, speeds = travel.positions(width), travel.speeds(speed, present)
         motors.target[at], motors.feed[at] = targets, 0.0
-        motors.efforts[at], motors.speeds[at] = travel.efforts(self._force, width), speeds
+        motors.efforts[at], motors.speeds[at] = travel.efforts(force, present), speeds
         if self._followers is not None:  # their couplings move them; the law of the motors has to expect it
             motors.target[self._followers] = [ratio * targets[of] + offset for of, ratio, offset in self._follow]
             motors.speeds[self._followers] = [abs(ratio) * speeds[of] for of, ratio, _ in self._follow]

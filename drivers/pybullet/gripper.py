@@ -27,13 +27,13 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
     def handle_fingers(self, active: bool) -> None:
         self.scene.handle(self.body.name, active)
 
-    def drive_fingers(self, speed: float) -> None:
-        client, travel, width = self.scene.client, self.travel, self.read_width()[0]
+    def drive_fingers(self, width: float, force: float, speed: float) -> None:
+        client, travel, present = self.scene.client, self.travel, self.read_width()[0]
         drives = zip(
             self._joints,
-            travel.positions(self._target),
-            travel.efforts(self._force, width),
-            travel.speeds(speed, width),
+            travel.positions(width),
+            travel.efforts(force, present),
+            travel.speeds(speed, present),
             strict=True,
         )
         for joint, position, effort, fastest in drives:
@@ -50,7 +50,7 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
 
     def resume_motors(self) -> None:
         if self._driven is not None:
-            self.drive_fingers(self._driven)
+            self.drive_fingers(*self._driven)
         else:
             targets = dict(zip(self._joints, self.travel.positions(self._target), strict=True))
             hold(self.scene.client, self.body, targets, self.scene.dt)

@@ -259,6 +259,8 @@ class RenderWorker:
         """Time of the world in each camera's last picture, s."""
         self._late: list[tuple[float, str, RawFrame]] = []
         """Pictures of cameras with a latency, and when they are handed out, s on the monotonic clock."""
+        self._handed_out = dict.fromkeys(self._exposures, 0)
+        """Number of each camera's newest picture that was handed out."""
 
     def warm_up(self) -> None:
         """Draw every camera once, so that meshes and shaders are ready when the first snapshot comes."""
@@ -289,7 +291,9 @@ class RenderWorker:
 
     def _hand_out(self, due: float, name: str, frame: RawFrame, now: float) -> None:
         if due <= now:
-            self._rings[name].write(frame)
+            if frame.seq > self._handed_out[name]:  # a shorter latency makes newer pictures overtake older ones
+                self._rings[name].write(frame)
+                self._handed_out[name] = frame.seq
         else:
             self._late.append((due, name, frame))
 

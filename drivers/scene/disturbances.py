@@ -49,7 +49,9 @@ class Delay(Generic[T]):
         self._out: T | None = None
 
     def put(self, step: int, item: T) -> None:
-        """Put something in at a step."""
+        """Put something in at a step, in place of what was put in at the same one."""
+        if self._waiting and self._waiting[-1][0] == step + self.steps:
+            self._waiting.pop()
         self._waiting.append((step + self.steps, item))
 
     def take(self, step: int) -> T | None:
@@ -91,6 +93,8 @@ class Disturbances:
         self._deviations = [0.0] * len(noise)
         self._command_noise = 0.0
         self._random = np.random.default_rng(0)
+        self._measured = -1
+        """The step at which was measured last."""
         self.active = False
         """Whether anything is disturbed."""
 
@@ -110,7 +114,7 @@ class Disturbances:
         late = self.commands.take(1 << 62)
         if late is not None:
             late()  # the newest command is not lost
-        self._known = drawn
+        self._known, self._measured = drawn, -1
         dt = self._world.dt
         self.sensed = Delay(round(drawn.get(self._section, "state_latency_s") / dt))
         self.commands = Delay(round(drawn.get(self._section, "command_latency_s") / dt))
@@ -123,16 +127,17 @@ class Disturbances:
         """Return what the device reports now of a measurement: its time, s of the world, and its parts.
 
         Args:
-            *parts: Numbers or sequences of them, in the order of the keys of the noise.
+            *parts: Numbers or sequences of them, in the order of the keys of the noise; further ones have none.
         """
         if not self.active:
             return self._world.t, parts
         step = self._world.steps
-        noisy = tuple(
-            self._blur(part, deviation) if deviation else part
-            for part, deviation in zip(parts, self._deviations, strict=True)
-        )
-        self.sensed.put(step, (self._world.t, noisy))
+        if step != self._measured:  # however often it is read
+            self._measured = step
+            noisy = list(parts)
+            for k, deviation in enumerate(self._deviations):
+                noisy[k] = self._blur(parts[k], deviation) if deviation else parts[k]
+            self.sensed.put(step, (self._world.t, tuple(noisy)))
         found = self.sensed.read(step)
         assert found is not None
         return found
@@ -157,3 +162,4 @@ class Disturbances:
         """Forget measurements and commands that are under way, after a reset or at a stop of the device's own."""
         self.sensed.clear()
         self.commands.clear()
+        self._measured = -1

@@ -128,7 +128,8 @@ class DrawnWorld:
         elif spec.urdf is not None:
             urdf = checked_urdf(spec.urdf, f"objects.{spec.name}.urdf")
         for package in absent_packages(str(urdf.path)) if urdf is not None else ():
-            self._absent.setdefault(package, []).append(spec.name)
+            names = self._absent.setdefault(package, [])
+            names += [spec.name] if spec.name not in names else []
         body = _body(next(self._numbers), spec, urdf)
         self.bodies[spec.name] = self._by_id[body.id] = body
 

@@ -131,15 +131,15 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._seen = 0
         """The step after which the width was read last."""
         self._speed = spec.speed
-        self._driven: float | None = None
-        """Speed of the motion that the motors make, m/s; None while they hold since a reset."""
+        self._driven: tuple[float, float, float] | None = None
+        """Width, m, force, N, and speed, m/s, of what the motors do; None while they hold since a reset."""
         self._engaged = True
         """Whether the fingers move or hold something."""
         self._placed = (0, 0.0, 0.0)
         """The step at which a reset or a restored state placed the fingers, and the force and the load (N) that are
         measured until the next one: the engine may still have those of before."""
         section = f"robots.{spec.arm}.gripper"
-        self._disturbances = Disturbances(world, section, ("width_noise", "force", "moving", "grasped"))
+        self._disturbances = Disturbances(world, section, ("width_noise",))
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -154,8 +154,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         """
 
     @abstractmethod
-    def drive_fingers(self, speed: float) -> None:
-        """Drive the fingers to the width :attr:`_target` with :attr:`_force`; ``speed`` is that of the width, m/s.
+    def drive_fingers(self, width: float, force: float, speed: float) -> None:
+        """Drive the fingers to a width, m, with a force, N; ``speed`` is that of the width, m/s.
 
         Where the travel :attr:`~FingerTravel.varies`, it is called before every step while the fingers move or hold
         something: what the joints need follows from the present width.
@@ -168,7 +168,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     def resume_motors(self) -> None:  # optional
         """Let the motors do what they did when a state was saved, if the engine's states are without those of motors.
 
-        They moved at :attr:`_driven` to :attr:`_target`, or held there since a reset.
+        They did :attr:`_driven`, or held at :attr:`_target` since a reset.
         """
 
     # --- the driver --------------------------------------------------------------------------------------------------
@@ -236,7 +236,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         if self._disturbances.active:
             self._disturbances.measure(*self._sense())
         if self.travel.varies and self._engaged and self._driven is not None:
-            self.drive_fingers(self._driven)
+            self.drive_fingers(*self._driven)
 
     def _expect_open(self) -> None:
         if not self._open:
@@ -247,18 +247,17 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._force = force
         self._speed = min(speed, self.spec.speed)
         self._resting, self._stood_since = False, self.scene.steps
-        self._settle = max(SETTLE, 2.0 * STILL / self._speed)
+        self._settle = max(SETTLE, 2.0 * STILL / self._speed) + self._disturbances.commands.steps * self.scene.dt
         self._engage(True)
         self._send(self._speed)
 
     def _send(self, speed: float) -> None:
         """Let the fingers go to the target, with a speed of the width, m/s, when the command arrives."""
-        self._settle += self._disturbances.commands.steps * self.scene.dt
-        self._disturbances.send(partial(self._carry_out, speed))
+        self._disturbances.send(partial(self._carry_out, self._target, self._force, speed))
 
-    def _carry_out(self, speed: float) -> None:
-        self._driven = speed
-        self.drive_fingers(speed)
+    def _carry_out(self, *motion: float) -> None:
+        width, force, speed = self._driven = motion
+        self.drive_fingers(width, force, speed)
 
     def _is_at_rest(self, width: float, speed: float) -> bool:
         """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""

@@ -72,7 +72,6 @@ class ShadowMap:
         self._texture.repeat_x = self._texture.repeat_y = False
         self._target = context.framebuffer(depth_attachment=self._texture)
         self._program = context.program(vertex_shader=_SHADOW_VERTEX, fragment_shader="#version 330\nvoid main() {}\n")
-        self._arrays: dict[int, Any] = {}
         self._shown: tuple[Any, ...] = ()
         self._to_light = np.eye(4)
         self.offset = 0.0
@@ -131,6 +130,8 @@ class ShadowMap:
         if known is None:
             mesh = drawable.part.mesh
             points = _coarsen(mesh.positions, mesh.faces, drawable.part.radius / _CELLS)
+            if not len(points):  # a rod, or what is so flat that it has no cell of its own
+                points = np.ascontiguousarray(mesh.positions[mesh.faces], np.float32)
             buffer = self._context.buffer(points.tobytes())
             content = [(buffer, "3f4", "position")]
             known = drawable.arrays["shadow"] = self._context.vertex_array(self._program, content)

@@ -138,6 +138,10 @@ class GLRenderer(Renderer):
     def close(self) -> None:
         with self._lock:
             if self._context is not None:
+                with self._context:
+                    for body in self._bodies.values():
+                        _release(body)
+                    self._context.finish()
                 self._context.release()
                 self._context = None
 

@@ -72,7 +72,7 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         noise = "position_noise", "velocity_noise", "torque_noise"
         self._disturbances = Disturbances(world, f"robots.{spec.name}", noise)
         self._arrived: tuple[Floats, Floats] | None = None
-        """What the motors follow while newer set-points are under way; None if it is the newest."""
+        """What the motors follow, which newer set-points that are under way are not; None before the first one."""
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -156,8 +156,14 @@ class SimulatedRobot(RobotDriver, Generic[W]):
             if self._tau is not None:
                 self.hold_at(q)  # puts the motors' speed limits back
                 self._tau = None
-            self.follow_setpoint(self._disturbances.blur_command(q), dq)
+            self.follow_setpoint(self._blur(q) if self._disturbances.active else q, dq)
         self._arrived = q, dq
+
+    def _blur(self, q: Floats) -> Floats:
+        """Return what the motors get of a set-point: with noise, which takes no joint over its limits."""
+        blurred, limits = self._disturbances.blur_command(q), self.spec.limits
+        ranges = zip(blurred, q, limits.lower, limits.upper, strict=True)
+        return [min(max(each, min(low, own)), max(high, own)) for each, own, low, high in ranges]
 
     def _keep_torques(self, tau: Floats) -> None:
         """Apply torques to each step and compensate gravity, as an arm's own controller does between commands."""
@@ -177,8 +183,8 @@ class SimulatedRobot(RobotDriver, Generic[W]):
             self._hold(self._q if self._tau is None else self._positions())
 
     def recover(self) -> None:
-        """Clear every fault; an arm that did not follow holds where it is."""
-        if self._away is not None:
+        """Clear every fault; an arm that did not follow, or to which commands are under way, holds where it is."""
+        if self._away is not None or (self._open and self._disturbances.commands.steps):
             self._hold(self._positions())
         self._connected, self._freeze, self._fault, self._away = True, False, None, None
 
@@ -211,8 +217,14 @@ class SimulatedRobot(RobotDriver, Generic[W]):
             self._hold(self._positions())
 
     def close(self) -> None:
-        """Disconnect; the motors hold the last set-point for as long as the world exists."""
-        self.halt()
+        """Disconnect; the motors hold the last set-point for as long as the world exists.
+
+        With a latency that is where the arm is: what is under way does not arrive any more.
+        """
+        if self._open and self._q is not None and self._disturbances.commands.steps:
+            self._hold(self._positions())
+        else:
+            self.halt()
         if self._open:
             self.scene.off_reset(self.spec.name, self._was_reset)
         self._open = False
@@ -223,14 +235,15 @@ class SimulatedRobot(RobotDriver, Generic[W]):
     def _hold(self, q: Floats) -> None:
         self.hold_at(q)
         self._q, self._dq = list(q), [0.0] * len(q)
-        self._tau = self._arrived = None
+        self._arrived, self._tau = (self._q, self._dq), None
         self._disturbances.commands.clear()
 
     def _positions(self) -> Floats:
         return self.read_state()[0]
 
     def _save(self) -> dict[str, Any]:
-        parts = {"q": self._q, "dq": self._dq, "tau": self._tau}
+        q, dq = self._arrived or (self._q, self._dq)  # commands that are under way are lost
+        parts = {"q": q, "dq": dq, "tau": self._tau}
         state: dict[str, Any] = {name: None if part is None else list(part) for name, part in parts.items()}
         return state | {"age": self.scene.steps - self._received}
 
@@ -238,13 +251,16 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         self._frozen = self._arrived = None
         self._disturbances.forget()
         self._q, self._dq, self._tau = state["q"], state["dq"], state["tau"]
+        if self._q is not None and self._dq is not None:
+            self._arrived = self._q, self._dq
         self._received = self.scene.steps - state["age"]
         self._away = None
         self._following.forget()
 
     def _was_reset(self) -> None:
-        self._frozen = self._arrived = None
+        self._frozen = None
         self._disturbances.forget()
         self._q, self._dq = self._positions(), [0.0] * len(self.spec.joints)
+        self._arrived = self._q, self._dq
         self._tau = self._away = None
         self._following.forget()

@@ -64,6 +64,7 @@ Elevation = Annotated[_Two, Several(Quantity("deg", 0.0, 90.0), 2, ENDS), _Order
 Shift = Annotated[_Two, Several(Quantity("m", -5.0, 5.0), 2, ENDS), _Order]
 Latency = Annotated[_Two, Several(Quantity("s", 0.0, 1.0), 2, ENDS), _Order]
 Noise = Annotated[_Two, Several(Quantity("", 0.0, 10.0), 2, ENDS), _Order]
+CommandNoise = Annotated[_Two, Several(Quantity("", 0.0, 0.1), 2, ENDS), _Order]
 TorqueNoise = Annotated[_Two, Several(Quantity("Nm", 0.0, 1000.0), 2, ENDS), _Order]
 ColorNoise = Annotated[_Two, Several(Quantity("", 0.0, 1.0), 2, ENDS), _Order]
 DepthNoise = Annotated[_Two, Several(Quantity("m", 0.0, 1.0), 2, ENDS), _Order]
@@ -126,8 +127,8 @@ class RobotVariation(BodyVariation):
 
     command_latency_s: Latency | None = None
     """Time from the servo to the motors."""
-    command_noise: Noise | None = None
-    """Standard deviation of what the motors get, rad (m for joints that slide)."""
+    command_noise: CommandNoise | None = None
+    """Standard deviation of what the motors get, rad (m for joints that slide); never beyond a joint's limits."""
     state_latency_s: Latency | None = None
     """Time from the sensors to the servo and to the program."""
     position_noise: Noise | None = None

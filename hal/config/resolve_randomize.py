@@ -58,8 +58,8 @@ def resolve_randomize(
             if len(config.distractors.objects) < config.distractors.count[1]:
                 text = f"asks for up to {config.distractors.count[1]:g} of {len(config.distractors.objects)} objects"
                 context.report(f"{SECTION}.distractors.count", text, "out_of_range")
+    _check_textures(context, config)
     if context.problems.found:  # else a name would be unknown because its file is wrong
-        _check_textures(context, config)
         return None
     links = {body.name: _links_of(body) for body in (*bodies, *distractors)}
     for robot in robots:
@@ -146,7 +146,7 @@ def _variations(context: Context, prefix: str, key: str, config: Strict) -> Iter
 
 
 def _check_textures(context: Context, config: RandomizeConfig) -> None:
-    """Report missing textures although something else is wrong, too."""
+    """Report missing textures, each at its place in the file."""
     with suppress(Unknown):
         records: list[tuple[str, Any]] = [("background", config.background)]
         for section in ("objects", "robots"):

@@ -188,3 +188,121 @@ def test_an_environment_varies_with_the_seed_of_its_reset(rig_file: Path) -> Non
         assert all(np.array_equal(again[key], value) for key, value in first.items())
     finally:
         env.close()
+
+
+def test_each_value_changes_what_it_is_for_and_a_record_holds_what_can_be_drawn(rig_file: Path) -> None:
+    with opened(rig_file, ENGINES[0]) as rig:
+        plain = pictures(rig)
+        drawn = next(record["values"] for seed in range(20) if _shows_much(record := rig.world.randomize(seed)))
+        for key in (
+            "light.0.azimuth_deg",
+            "light.ambient",
+            "background.color",
+            "objects.table.texture",
+            "objects.cube.color",
+            "robots.panda.links.panda_hand.color",
+            "cameras.scene.exposure",
+            "cameras.scene.color_noise",
+            "cameras.scene.depth_noise",
+        ):
+            rig.world.randomize({"seed": 1, "values": {key: drawn[key]}})
+            seen = pictures(rig)
+            changed = [name for name in seen if not np.array_equal(seen[name], plain[name])]
+            assert changed == ["scene.depth" if "depth" in key else "scene.color"], key
+        rig.world.randomize(None)
+        assert same(pictures(rig), plain)
+        for wrong in (
+            {"robots.panda.command_latency_s": -3.0},
+            {"robots.panda.command_latency_s": "2"},
+            {"cameras.scene.position_m": [0.0]},
+            {"distractors": ["mug"]},
+            {"light.hue": 1.0},
+        ):
+            with pytest.raises(hal.CommandError) as found:
+                rig.world.randomize({"seed": 1, "values": wrong})
+            assert found.value.code == "bad_record"
+        assert same(pictures(rig), plain)
+
+
+def _shows_much(record: Any) -> bool:
+    values = record["values"]
+    return bool(values["objects.table.texture"]) and abs(values["cameras.scene.exposure"] - 1.0) > 0.1
+
+
+def test_commands_under_way_move_no_arm_after_its_link_was_lost(late: hal.Rig) -> None:
+    arm, device = late.robots["panda"], late.driver("panda")
+    late.world.randomize(0)
+    with pytest.raises(hal.HalError), arm.control(rate_hz=240) as control:
+        for tick in late.clock.rate(240):
+            control.send(hal.JointVelocity([0.5, 0, 0, 0, 0, 0, 0]))
+            if tick.elapsed > 0.5:
+                device.inject(disconnect=True)
+    late.clock.sleep(0.5)
+    there = late.world.pose("panda", "panda_hand")
+    arm.recover()
+    late.clock.sleep(0.5)
+    assert there.distance(late.world.pose("panda", "panda_hand"))[0] < 1e-3
+
+
+def test_late_fingers_do_one_command_after_the_other() -> None:
+    varies = {"robots": {"*": {"gripper": {"command_latency_s": [0.2, 0.2]}}}}
+    config = {"robots": {"panda": {"model": "panda"}}, "simulation": {"physics_hz": 240, "randomize": varies}}
+    with opened(config, ENGINES[0]) as rig:
+        gripper = rig.robots["panda"].gripper
+        assert gripper is not None
+        rig.world.randomize(0)
+        gripper.start(0.0)
+        rig.clock.sleep(0.19)
+        assert gripper.state().width > 0.078, "the first command has not arrived"
+        gripper.start(0.08)
+        rig.clock.sleep(0.19)
+        assert gripper.state().width < 0.07, "the second one has not arrived"
+        rig.clock.sleep(1.5)
+        assert gripper.state().width > 0.078
+
+
+def test_noise_of_commands_takes_no_joint_over_its_limits() -> None:
+    varies = {"robots": {"*": {"command_noise": [0.1, 0.1]}}}
+    config = {"robots": {"panda": {"model": "panda"}}, "simulation": {"physics_hz": 240, "randomize": varies}}
+    with opened(config, ENGINES[0]) as rig:
+        arm = rig.robots["panda"]
+        goal = np.array(arm.home)
+        goal[0] = arm.limits.upper[0] - 1e-4
+        arm.move_to(goal)
+        rig.world.randomize(0)
+        seen = []
+        with arm.control(rate_hz=240) as control:
+            for tick in rig.clock.rate(240):
+                control.send(hal.JointTarget(goal))
+                seen.append(arm.state().q[0])
+                if tick.elapsed > 0.5:
+                    break
+        assert np.ptp(seen) > 1e-3, "the arm shakes"
+        assert max(seen) < arm.limits.upper[0] + 2e-3
+
+
+def test_a_late_arm_follows_from_where_a_reset_put_it() -> None:
+    """Its following error is that of the set-points that arrived, also before the first one has."""
+    varies = {"robots": {"*": {"command_latency_s": [0.4, 0.4]}}}
+    config = {"robots": {"panda": {"model": "panda"}}, "simulation": {"physics_hz": 240, "randomize": varies}}
+    with opened(config, ENGINES[0]) as rig:
+        arm = rig.robots["panda"]
+        rig.world.randomize(0)
+        rig.world.reset()
+        with arm.control(rate_hz=60) as control:
+            for tick in rig.clock.rate(60):
+                control.send(hal.JointVelocity([1.0, 0, 0, 0, 0, 0, 0]))
+                if tick.elapsed > 1.0:
+                    break
+        assert arm.state().q[0] - arm.home[0] > 0.3
+
+
+def test_a_thin_rod_casts_a_shadow(tmp_path: Path) -> None:
+    """All of its corners are within one cell of the coarse mesh that casts shadows."""
+    rod = '<visual><origin xyz="0.02 0.02 0"/><geometry><cylinder radius="0.005" length="0.5"/></geometry></visual>'
+    (tmp_path / "rod.urdf").write_text(f'<robot name="rod"><link name="base">{rod}</link></robot>')
+    eye = {"model": "pinhole", "capture": {"width": 64, "height": 64, "rate_hz": 30}, "pose": {"position": [0, 0, 2]}}
+    things = [{"name": "rod", "urdf": str(tmp_path / "rod.urdf"), "position": [0, 0, 1], "fixed": True}]
+    eye |= {"field_of_view": {"vertical_deg": 50}, "streams": ["color"]}
+    with opened({"cameras": {"eye": eye}, "objects": ["floor", *things]}, ENGINES[0]) as rig:
+        assert rig.cameras["eye"].read().color is not None
