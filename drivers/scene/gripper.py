@@ -255,8 +255,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         """Let the fingers go to the target, with a speed of the width, m/s, when the command arrives."""
         self._disturbances.send(partial(self._carry_out, self._target, self._force, speed))
 
-    def _carry_out(self, *motion: float) -> None:
-        width, force, speed = self._driven = motion
+    def _carry_out(self, width: float, force: float, speed: float) -> None:
+        self._driven = width, force, speed
         self.drive_fingers(width, force, speed)
 
     def _is_at_rest(self, width: float, speed: float) -> bool:
