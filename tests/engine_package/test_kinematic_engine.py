@@ -46,10 +46,8 @@ class TestKinematicRobot(RobotContract, left_out={"torque": "nothing has a mass"
 
 
 def test_a_rig_is_opened_with_the_engine_by_its_name():
-    model = {"model": "panda", "gripper": {"enabled": False}}
-    with hal.open(
-        {"robots": {"arm": model}, "simulation": {"engine": "kinematic"}}, sim=True, clock="lock_step"
-    ) as rig:
+    robots = {"arm": {"model": "panda", "gripper": {"enabled": False}}}
+    with hal.open({"robots": robots, "simulation": {"engine": "kinematic"}}, sim=True, clock="lock_step") as rig:
         arm = rig.robots["arm"]
         goal = arm.home + 0.1
         assert abs(arm.move_to(goal).q - goal).max() < 1e-6
