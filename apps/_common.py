@@ -462,6 +462,8 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
                 try:
                     status = int(main(args))
                 except SystemExit as end:  # of resolve_plan
+                    if not isinstance(end.code, int | None):
+                        raise  # a message of a user's module
                     status = int(end.code or 0)
         finally:
             sys.stdout.flush()  # while what fails can still be reported

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import socket
 import struct
 from collections.abc import Iterator
@@ -32,7 +31,7 @@ def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str]]:
         yield "model", f"this arm has 6 joints, not {len(spec.joints)}"
 
 
-def make_fast(line: socket.socket) -> None:
+def set_nonblocking(line: socket.socket) -> None:
     line.setblocking(False)  # no call waits for the network
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -46,20 +45,21 @@ class TcpArm(RobotDriver):
     def open(self) -> None:
         self.close()
         self.place = self.spec.options["host"], self.spec.options.get("port", 4777)
-        self.came, self.t_heard, self.t_tried = b"", math.inf, 0.0
+        self.came, self.t_heard, self.t_tried = b"", float("inf"), float("inf")
         try:
             self.line = socket.create_connection(self.place, timeout=2.0)
+            self.place = self.line.getpeername()[:2]  # read() must not wait for a name to be looked up
             if not self.line.recv(1, socket.MSG_PEEK):  # it answers: its first state is left for read()
                 raise OSError("it hung up")
         except OSError as error:
             self.close()
             raise ConnectionLost(f"no arm at {self.place}: {error}; switch it on, and check real.host") from error
-        make_fast(self.line)
+        set_nonblocking(self.line)
 
     def read(self, now: float) -> Reading:
         if self.line is None:
             raise ConnectionLost(f"{self.spec.name} is not open")
-        why = self.receive(self.line)
+        why, self.t_tried = self.receive(self.line), min(self.t_tried, now)
         end = len(self.came) // STATE.size * STATE.size
         if end:  # at least one whole state: use the newest
             seq, ms, number, *x = STATE.unpack(self.came[end - STATE.size : end])
@@ -114,7 +114,7 @@ class TcpArm(RobotDriver):
         self.last = None
         if now - self.t_tried > SILENCE and self.line is not None:
             self.line.close()
-            self.line, self.came, self.t_heard, self.t_tried = socket.socket(), b"", now, now
-            make_fast(self.line)
+            self.line, self.came, self.t_heard, self.t_tried = socket.socket(self.line.family), b"", now, now
+            set_nonblocking(self.line)
             self.line.connect_ex(self.place)  # returns at once
         return ConnectionLost(f"{self.spec.name} at {self.place}: {why}")

@@ -49,7 +49,7 @@ def compose_urdf(arm: Path, tool: MountedTool | None = None, freed: Collection[s
         ValueError: A file is no URDF, the arm has no such link, or a freed joint is not fixed or has no limits.
         OSError: A file cannot be read, or the cache cannot be written.
     """
-    root = _read_urdf(arm)
+    root = _parse_with_absolute_files(arm)
     for name in freed:
         joint = next((one for one in root.findall("joint") if one.get("name") == name), None)
         if joint is None or joint.get("type") != "fixed" or joint.find("limit") is None:
@@ -74,7 +74,7 @@ def divide_urdf(robot: UrdfModel, joints: Collection[str], others: Collection[st
     Raises:
         OSError: The file cannot be read, or the cache cannot be written.
     """
-    root = _read_urdf(robot.path)
+    root = _parse_with_absolute_files(robot.path)
     above = {link: list(robot.above(link)) for link in robot.links}
     movers = {link: {joint.name for joint in found} for link, found in above.items()}
     own = {link for link, names in movers.items() if not names.isdisjoint(joints)}
@@ -110,7 +110,7 @@ def _cache_folder() -> Path:
     return Path(root, "robot-hal", "urdf")
 
 
-def _read_urdf(urdf: Path) -> ElementTree.Element:
+def _parse_with_absolute_files(urdf: Path) -> ElementTree.Element:
     root = parse_xml(urdf)
     if root.tag != "robot":
         raise ValueError(f"is not a URDF: its root element is <{root.tag}>, not <robot>")
@@ -125,7 +125,7 @@ def _read_urdf(urdf: Path) -> ElementTree.Element:
 
 
 def _mount(root: ElementTree.Element, tool: MountedTool) -> None:
-    added = _read_urdf(tool.urdf)
+    added = _parse_with_absolute_files(tool.urdf)
     names = {(one.tag, one.get("name", "")) for one in root}
     if ("link", tool.link) not in names:
         raise ValueError(f"has no link {tool.link!r}")

@@ -254,6 +254,7 @@ def reset_scene(
     since: int | None = None,
     patience: float = 60.0,
     open_gripper: bool = True,
+    vary: bool = True,
 ) -> dict[str, Pose]:
     """Bring a scene to its start: objects at their start poses and the arm at its start position.
 
@@ -274,6 +275,7 @@ def reset_scene(
         since: Count of presses that a new press must exceed; None for the count at this call.
         patience: Longest time to wait for the dead-man, s.
         open_gripper: Whether a real gripper opens, which drops what it holds.
+        vary: Whether the scene is varied; with several arms, in the reset of the last one.
 
     Returns:
         The poses of the placed objects.
@@ -293,7 +295,7 @@ def reset_scene(
             robot.gripper.open()
     if not rig.has_world:
         return {}
-    _vary(rig.world, rig.plan.world, random, seed)
+    _vary(rig.world, rig.plan.world if vary else None, random, seed)
     rig.world.reset()
     placed = _place_objects(rig, poses, random)
     if inside:

@@ -326,6 +326,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
                 seed=seed if last else None,
                 deadman=self._deadman,
                 unattended=self._unattended,
+                vary=last,
             )
         self._place(starts)
         self.arrange(options)

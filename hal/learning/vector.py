@@ -89,14 +89,14 @@ def make_vec(
     modes = [mode.value for mode in AutoresetMode]
     if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
         raise CommandError(f"autoreset_mode is one of {', '.join(modes)}, not {autoreset_mode!r}", code="bad_autoreset")
-    if isinstance(env, str):
-        try:
-            make = partial(gymnasium.make, gymnasium.spec(env), disable_env_checker=True, **options)
+    if callable(env):
+        make = partial(env, **options)
+    else:
+        try:  # str: also of a rig file, or the data of one, which are no name
+            make = partial(gymnasium.make, gymnasium.spec(str(env)), disable_env_checker=True, **options)
         except gymnasium.error.Error as error:
             text = f"{error} A class of environments is passed itself: make_vec(RigEnv, 4, rig={env!r})"
             raise CommandError(text, code="unknown_environment") from None
-    else:
-        make = partial(env, **options)
     return RigVectorEnv(make, int(num_envs), int(min(num_envs, processes)), AutoresetMode(autoreset_mode))
 
 
@@ -370,7 +370,7 @@ class _Worlds:
                 seen, info = env.reset()
                 info = final | info
             self._write(self._records.observations, k, seen)
-            results[k] = reward, info.pop("elapsed"), terminated, truncated
+            results[k] = reward, info.pop("elapsed", np.nan), terminated, truncated
             return info
 
         try:

@@ -79,13 +79,10 @@ class TorqueMotion(ServoMotion):
         self.dq: Floats = smoother.dq
         """Newest measured joint speeds (n,), rad/s."""
         self._inertia: Inertia | None = None
-        self._weighed_at: Floats | None = None
-        """Joint positions of the inertia, rad."""
         self.arm: ArmInMotion | None = None
         """Newest measured state of the arm; None while it is unknown."""
-        self._tcp_at: Floats | None = None
-        """Joint positions of :meth:`tcp`, rad."""
-        self._tcp: TcpInMotion
+        self._tcp: TcpInMotion | None = None
+        """Newest measured state of the tcp; None until it is asked for."""
         self._solver = make_solver(self.size)
         self.friction: Array | None = None
         """What friction adds to the inertia that a controller's torques move in one tick (n, n), kg m2."""
@@ -112,7 +109,6 @@ class TorqueMotion(ServoMotion):
     def open(self) -> None:
         """Open a session, at rest."""
         self.margin_share = 1.0
-        self._weighed_at = None  # a session of another kind has other friction
         if self.bounds is not None:
             self.bounds.open_session(self.smoother.q)
 
@@ -125,7 +121,7 @@ class TorqueMotion(ServoMotion):
             self._still = 0.0
             return
         self._update_inertia()  # where the arm was a tick ago: it is the same
-        self.q, self.dq = reading.q, reading.dq
+        self.q, self.dq, self._tcp = reading.q, reading.dq, None
         if reading.tau_commanded is not None:
             self.tau = list(reading.tau_commanded)  # what was lost on its way must not make the next step greater
         self._still = self._still + dt if max(map(abs, reading.dq)) < _REST else 0.0
@@ -133,8 +129,7 @@ class TorqueMotion(ServoMotion):
 
     def tcp(self) -> TcpInMotion:
         """Return the state of the tcp where the arm was measured last."""
-        if self._tcp_at is not self.q:
-            self._tcp_at = self.q
+        if self._tcp is None:
             q, dq = np.array((self.q, self.dq))
             pose, jacobian = self.envelope.kinematics.fk_and_jacobian(q)
             self._tcp = TcpInMotion(pose, jacobian, jacobian[:3].dot(dq), q, dq)
@@ -142,10 +137,7 @@ class TorqueMotion(ServoMotion):
 
     def _update_inertia(self) -> None:
         """Compute the inertia where the arm was measured last; None if it is invalid."""
-        if self._weighed_at is self.q:
-            return
         assert self._mass_matrix is not None
-        self._weighed_at = self.q
         try:
             friction = self.friction if self.by_controller else None
             self._inertia = Inertia(self._mass_matrix(self.q), self.size, friction, self._solver)
@@ -211,7 +203,7 @@ class TorqueMotion(ServoMotion):
         self._begun = self._given_up = False
         self._overran = None
         self._unseen = self._still = self._braking = self._share = 0.0
-        self.arm = None
+        self.arm = self._tcp = None
         if self.envelope.collisions is not None:
             self.envelope.collisions.measured.start(self.q, self.margin_share)
         self._update_inertia()

@@ -179,7 +179,6 @@ class TorqueBounds:
         self._envelope = envelope
         self._kinematics = envelope.kinematics
         self._reach = self._kinematics.reach()
-        self._reach_length = hypot(*self._reach)
         self._slowest = min(limits.velocity)
         # Positions this near to the middle of their ranges are in them: one distance, not two comparisons a joint.
         self._middle = [0.5 * (low + high) for low, high in zip(limits.lower, limits.upper, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,16 +13,18 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_an_engine_of_another_package_passes_the_contract_and_moves_the_arm_of_a_rig(tmp_path: Path) -> None:
-    for file in (*(ROOT / "tests" / "engine_package").glob("*.py"), ROOT / "examples" / "tcp_arm" / "tcp_arm.yaml"):
-        shutil.copy(file, tmp_path)
-    about = tmp_path / "kinematic_engine-1.0.dist-info"
+    folder = tmp_path / "kinematic_engine"
+    shutil.copytree(ROOT / "tests" / "engine_package", folder, ignore=shutil.ignore_patterns("__pycache__"))
+    about = folder / "kinematic_engine-1.0.dist-info"  # what pip would make of pyproject.toml
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: kinematic-engine\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[hal.drivers]\nkinematic = kinematic_engine:DRIVER\n")
+    points = re.search(r'entry-points."(.*?)"\].*\n((?:\w.*\n)+)', (folder / "pyproject.toml").read_text())
+    assert points is not None
+    (about / "entry_points.txt").write_text(f"[{points[1]}]\n{points[2].replace(chr(34), '')}")
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_kinematic_engine.py"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])},
         capture_output=True,
         text=True,
         timeout=90,

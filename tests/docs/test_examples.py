@@ -67,7 +67,7 @@ def test_the_driver_to_copy_passes_its_tests_outside_and_is_found_by_name_once_i
     assert len((folder / "tcp_arm.py").read_text().splitlines()) <= 120
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tcp_arm"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=90)
-    assert "26 passed" in done.stdout, done.stdout + done.stderr
+    assert "27 passed" in done.stdout, done.stdout + done.stderr
     about = folder / "tcp_arm-1.0.dist-info"  # what pip would make of pyproject.toml
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: tcp-arm\nVersion: 1.0\n")

@@ -1,6 +1,6 @@
 """The engine of this folder as its author tests it: the contracts of worlds and arms.
 
-``tests/contract/test_outside_engine.py`` runs this file elsewhere, as a package that is installed beside robot-hal.
+``tests/contract/test_outside_engine.py`` runs this folder elsewhere, as a package that is installed beside robot-hal.
 """
 
 from __future__ import annotations
@@ -46,9 +46,8 @@ class TestKinematicRobot(RobotContract, left_out={"torque": "nothing has a mass"
 
 
 def test_a_rig_is_opened_with_the_engine_by_its_name():
-    model = str(Path(__file__).with_name("tcp_arm.yaml"))
-    rig_data = {"robots": {"arm": {"model": model}}, "simulation": {"engine": "kinematic"}}
-    with hal.open(rig_data, sim=True, clock="lock_step") as rig:
+    robots = {"arm": {"model": "panda", "gripper": {"enabled": False}}}
+    with hal.open({"robots": robots, "simulation": {"engine": "kinematic"}}, sim=True, clock="lock_step") as rig:
         arm = rig.robots["arm"]
         goal = arm.home + 0.1
         assert abs(arm.move_to(goal).q - goal).max() < 1e-6

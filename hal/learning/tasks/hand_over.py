@@ -44,14 +44,14 @@ class HandOver(TaskEnv):
         x, y = self.centre + self.np_random.uniform((-0.02, -0.06), (0.02, 0.06))
         return {"bar": Pose.from_rpy((x, y, TALL / 2), (0.0, 0.0, self.np_random.uniform(-TURN, TURN)))}
 
-    def held(self) -> tuple[bool, bool]:
+    def find_holders(self) -> tuple[bool, bool]:
         """Return whether the left and the right hand hold the bar at their ends."""
         left, right = (hand.holds(self.poses["bar"], end) for hand, end in zip(self.hands, ENDS, strict=True))
         return left, right
 
     def success(self) -> bool:
         """Return whether the right hand alone holds the bar over the table."""
-        left, right = self.held()
+        left, right = self.find_holders()
         lifted = self.poses["bar"].position[2] > HIGH
         return bool(right and lifted and not left and self.hands[0].opening > WIDTH + 0.005)
 
@@ -59,7 +59,7 @@ class HandOver(TaskEnv):
         """Return -1 to 0: reach, hold, meet, let go."""
         if self.success():
             return 0.0
-        bar, (left, right) = self.poses["bar"], self.held()
+        bar, (left, right) = self.poses["bar"], self.find_holders()
         near, far = (
             closeness(hand.tcp.position, bar.transform(end)) for hand, end in zip(self.hands, ENDS, strict=True)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from ...geometry import Pose
 from .task_env import CLOSED, HEIGHT, OPEN, Action, TaskEnv, closeness
@@ -35,25 +36,27 @@ class OpenDrawer(TaskEnv):
     def place(self) -> dict[str, Pose]:
         """Return a random pose of the cabinet."""
         x, y = self.centre + self.np_random.uniform((0.08, -0.06), (0.12, 0.06))
-        cabinet = Pose.from_rpy((x, y, 0.0), (0.0, 0.0, self.np_random.uniform(-TURN, TURN)))
-        self.closed = cabinet @ Pose(POST)
-        """Pose of the post when the drawer is closed."""
-        return {"drawer": cabinet}
+        return {"drawer": Pose.from_rpy((x, y, 0.0), (0.0, 0.0, self.np_random.uniform(-TURN, TURN)))}
 
-    def opened(self) -> float:
+    def arrange(self, options: dict[str, Any]) -> None:
+        """Note where the post is while the drawer is closed, wherever the cabinet was put."""
+        self.closed = self.poses["drawer"] @ Pose(POST)
+        """Pose of the post when the drawer is closed."""
+
+    def measure_opening(self) -> float:
         """Return how far the drawer is open, m."""
         return -float(self.closed.inverse().transform(self.poses["drawer"].position)[0])
 
     def success(self) -> bool:
         """Return whether the drawer is open and the arm at rest."""
-        return self.opened() > WIDE and self.at_rest
+        return self.measure_opening() > WIDE and self.at_rest
 
     def reward(self) -> float:
         """Return -1 to 0: reach, pull."""
         if self.success():
             return 0.0
         near = closeness(self.tcp.position, self.poses["drawer"].position)
-        return -1.0 + 0.5 * near + 0.5 * min(1.0, max(0.0, self.opened() / WIDE))
+        return -1.0 + 0.5 * near + 0.5 * min(1.0, max(0.0, self.measure_opening() / WIDE))
 
     def solve(self) -> Iterator[Action]:
         """Yield actions: above the post, down, close, pull."""

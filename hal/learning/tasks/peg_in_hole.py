@@ -51,23 +51,21 @@ class PegInHole(TaskEnv):
 
     def place(self) -> dict[str, Pose]:
         """Return random start poses of the peg and the board."""
-        while True:
-            peg, board = self.draw(LENGTH / 2), self.draw(0.0)
-            if np.linalg.norm((peg.position - board.position)[:2]) >= APART:
-                return {"peg": peg, "board": board}
+        peg, board = self.draw_apart(LENGTH / 2, 0.0, APART)
+        return {"peg": peg, "board": board}
 
-    def off(self) -> Array:
+    def measure_offset(self) -> Array:
         """Return how far the peg is from its place (3,), m."""
         return self.poses["peg"].position - self.poses["board"].position - (0.0, 0.0, LENGTH / 2)
 
-    def inserted(self) -> bool:
+    def is_inserted(self) -> bool:
         """Return whether the peg is in the hole, held or not."""
-        off = self.off()
+        off = self.measure_offset()
         return bool(np.linalg.norm(off[:2]) < 0.01 and off[2] < 0.01)
 
     def success(self) -> bool:
         """Return whether the peg is at rest in the hole."""
-        return self.inserted() and self.speed("peg") < STILL
+        return self.is_inserted() and self.speed("peg") < STILL
 
     def reward(self) -> float:
         """Return -1 to 0: reach, hold, insert."""
@@ -75,7 +73,7 @@ class PegInHole(TaskEnv):
             return 0.0
         peg = self.poses["peg"]
         near = closeness(self.tcp.position, peg.transform((0.0, 0.0, GRASPED - LENGTH / 2)))
-        brought = (self.holds("peg") or self.inserted()) * (1.0 + closeness(self.off(), np.zeros(3)))
+        brought = (self.holds("peg") or self.is_inserted()) * (1.0 + closeness(self.measure_offset(), np.zeros(3)))
         return -1.0 + (near + brought) / 3.0
 
     def solve(self) -> Iterator[Action]:

@@ -37,31 +37,29 @@ class StackCubes(TaskEnv):
 
     def place(self) -> dict[str, Pose]:
         """Return random start poses of the cubes."""
-        while True:
-            red, green = self.draw(SIDE / 2), self.draw(SIDE / 2)
-            if red.distance(green)[0] >= APART:
-                return {"red": red, "green": green}
+        red, green = self.draw_apart(SIDE / 2, SIDE / 2, APART)
+        return {"red": red, "green": green}
 
-    def off(self) -> Array:
+    def measure_offset(self) -> Array:
         """Return how far the red cube is from its place (3,), m."""
         return self.poses["red"].position - self.poses["green"].position - (0.0, 0.0, SIDE)
 
-    def stacked(self) -> bool:
+    def is_stacked(self) -> bool:
         """Return whether the red cube is on the green one, held or not."""
-        off = self.off()
+        off = self.measure_offset()
         return bool(np.linalg.norm(off[:2]) < BESIDE and abs(off[2]) < 0.005)
 
     def success(self) -> bool:
         """Return whether the red cube rests on the green one, and the fingers do not hold it."""
-        return self.stacked() and self.opening > SIDE + 0.005 and self.speed("red") < STILL
+        return self.is_stacked() and self.opening > SIDE + 0.005 and self.speed("red") < STILL
 
     def reward(self) -> float:
         """Return -1 to 0: reach, hold, bring, let go."""
         if self.success():
             return 0.0
-        stacked, held = self.stacked(), self.holds("red")
+        stacked, held = self.is_stacked(), self.holds("red")
         near = closeness(self.tcp.position, self.poses["red"].position)
-        brought = (held or stacked) * (1.0 + closeness(self.off(), np.zeros(3)))
+        brought = (held or stacked) * (1.0 + closeness(self.measure_offset(), np.zeros(3)))
         return -1.0 + (near + brought + stacked * (self.opening > SIDE + 0.005)) / 4.0
 
     def solve(self) -> Iterator[Action]:

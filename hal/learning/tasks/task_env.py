@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from difflib import get_close_matches
+from inspect import signature
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
@@ -54,8 +55,10 @@ _BOUND = 2.0
 """Bound of the positions in an observation, m."""
 _GAIN = UPRIGHT_GAIN
 """Velocity of a scripted motion for each metre or radian to its goal, 1/s."""
-_LONGEST = 300
-"""Most steps of one way of a scripted solution: those of the longest episode."""
+_LONGEST = 15.0
+"""Longest time of one way of a scripted solution, s."""
+_DRAWS = 1000
+"""Most pairs of poses that are drawn until two objects are apart."""
 _ARRIVED = (0.004, 0.03)
 """Distance and angle from its goal at which a scripted motion has arrived, m and rad."""
 _RECENT = 10
@@ -95,7 +98,8 @@ class TaskEnv(RigEnv):
     most: an agent that is paid for every step learns to put the end off.
 
     On a real or emulated arm (``rig=``, ``sim=False``) the poses of the objects are found in the picture of a camera
-    with depth. The arm drives to its start in each reset, and a person puts the objects into the work area.
+    with depth. The arm drives to its start in each reset, and a person puts the objects into the work area. While it
+    does not show all of them, a step is paid -1, and ``info["hidden"]`` names them.
 
     Args:
         robot: Name of a model with a gripper (``hal list robots``), or a dict: its entry in a rig file. With ``rig``
@@ -244,18 +248,32 @@ class TaskEnv(RigEnv):
         x, y = self.centre + self.np_random.uniform(-AREA, AREA, 2)
         return Pose.from_rpy((x, y, height), (0.0, 0.0, self.np_random.uniform(-_TURN, _TURN)))
 
+    def draw_apart(self, first: float, second: float, apart: float) -> tuple[Pose, Pose]:
+        """Return two such poses at these heights, m, at least ``apart`` from each other across the table, m."""
+        for _ in range(_DRAWS):
+            a, b = self.draw(first), self.draw(second)
+            if np.linalg.norm((a.position - b.position)[:2]) >= apart:
+                return a, b
+        raise CommandError(f"there is no room for two objects {apart} m apart in the work area", code="no_room")
+
     def go(self, position: ArrayLike, yaw: float, grip: float, hand: int = 0) -> Iterator[Action]:
-        """Yield actions until a tcp is at a position (3,), m, and its hand turned by ``yaw`` about z; at most 15 s.
+        """Yield actions until a tcp is at a position (3,), m, and its hand turned by ``yaw`` about z.
 
         A ``yaw`` of 0 is straight ahead for that arm, rad.
+
+        Raises:
+            CommandError: It was not there after 15 s (code ``not_arrived``).
         """
-        for _ in range(_LONGEST):
+        for _ in range(round(_LONGEST * self.settings.rate_hz)):
             tcp = self.hands[hand].tcp
             turn = fold(self.hands[hand].ahead + yaw - yaw_of(tcp), 2.0 * math.pi)
             off = np.append(np.subtract(position, tcp.position), turn)
             if np.linalg.norm(off[:3]) < _ARRIVED[0] and abs(off[3]) < _ARRIVED[1]:
                 return
             yield self.move(_GAIN * off, grip, hand)
+        x, y, z = np.asarray(position, float).round(3)
+        text = f"{self.hands[hand].robot.name} did not arrive at ({x}, {y}, {z}) m within {_LONGEST:g} s"
+        raise CommandError(f"{text}: something is in its way, or it was stopped", code="not_arrived")
 
     def move(self, velocity: ArrayLike, grip: float, hand: int = 0) -> Action:
         """Return the action for a velocity (4,): of a tcp along x, y and z, m/s, and of its turn about z, rad/s.
@@ -329,7 +347,8 @@ class TaskEnv(RigEnv):
         for hand, own in zip(self.hands, np.clip(numbers, -1.0, 1.0).reshape(-1, 5), strict=True):
             twists += [*hand.twist(own[:4] * self._most, self._most), 0.5 * (own[4] + 1.0)]
         shown, reward, done, truncated, info = super().step(np.array(twists, np.float32))
-        done = done and not self.hidden
+        if self.hidden:  # where they are is not known
+            done, reward, info["hidden"] = False, -1.0, sorted(self.hidden)
         return shown, float(done) - 1.0 if self._sparse else reward, done, truncated, info | {"success": done}
 
     # Details.
@@ -451,19 +470,7 @@ class TaskEnv(RigEnv):
 
 def _check_arguments(task: type[TaskEnv], unknown: Mapping[str, Any], **choices: tuple[Any, Any]) -> None:
     """Raise CommandError for an unknown argument, or a value that is none of those allowed."""
-    known = (
-        "robot",
-        "rig",
-        "sim",
-        "engine",
-        "reward_type",
-        "judge",
-        "distance",
-        "rate_hz",
-        "overrides",
-        "deadman",
-        "unattended",
-    )
+    known = [name for name in signature(TaskEnv).parameters if name != "unknown"]
     for name in unknown:
         near = get_close_matches(name, known, 1)
         advice = f"did you mean {near[0]}=?" if near else f"its arguments: {', '.join(known)}"

@@ -65,11 +65,20 @@ def test_a_mistake_is_a_message(words: list[str], text: str) -> None:
 
 
 PACKAGE = """
+import argparse
+import sys
+from hal.apps._common import program
 from hal.errors import CommandError
+
+@program(lambda: argparse.ArgumentParser(prog="far-away"))
+def end(args):
+    sys.exit("the scanner is off")
 
 def main(arguments):
     if arguments == ["--wrong"]:
         raise CommandError("--wrong is wrong")
+    if arguments == ["--end"]:
+        end([])
     print("there:", *arguments)
     return 7
 """
@@ -85,6 +94,8 @@ def test_an_installed_package_adds_a_program(tmp_path: Path, monkeypatch: pytest
     assert run_here(main, "far-away", "--here", "x") == (7, "there: --here x\n", "")
     done = run_here(main, "far-away", "--wrong")
     assert (done.returncode, done.stderr) == (2, "CommandError: --wrong is wrong\n")
+    with pytest.raises(SystemExit, match="the scanner is off"):  # Python prints it, and ends with 1
+        main(["far-away", "--end"])
 
 
 @pytest.mark.parametrize("name", BESIDE)

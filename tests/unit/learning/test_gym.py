@@ -21,6 +21,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from hal.gym import EnvSettings, RigEnv  # noqa: E402
+from hal.world import World  # noqa: E402
 
 BARE = ("cameras={}",)
 
@@ -461,6 +462,23 @@ def test_two_arms_are_one_environment_with_their_names_in_front() -> None:
         *_, truncated, info = env.step(action)
         assert truncated
         assert info["stopped"].startswith("left: ")
+    finally:
+        env.close()
+
+
+def test_a_scene_with_two_arms_is_varied_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, randomize = [], World.randomize
+    monkeypatch.setattr(World, "randomize", lambda world, seed: seeds.append(seed) or randomize(world, seed))
+    varied = {
+        **TWO_ARMS,
+        "objects": ["cube"],
+        "simulation": {"randomize": {"objects": {"cube": {"mass_scale": [0.5, 2]}}}},
+    }
+    env = RigEnv(varied, EnvSettings(robots=["left", "right"]), sim=True)
+    try:
+        seeds.clear()
+        _, info = env.reset(seed=3)
+        assert (seeds, info["randomization"]["seed"]) == ([3], 3)
     finally:
         env.close()
 

@@ -21,6 +21,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from hal.gym import TaskEnv, make_vec  # noqa: E402
 from hal.learning.tasks import TASKS  # noqa: E402
+from hal.learning.tasks.by_depth import DepthJudge  # noqa: E402
 from hal.learning.tasks.pick_cube import PickCube  # noqa: E402
 from hal.recording import Dataset, Recorder  # noqa: E402
 
@@ -197,5 +198,47 @@ def test_an_object_out_of_reach_and_a_step_before_the_reset_are_refused() -> Non
         env.reset()
         with raises_code(hal.CommandError, "bad_action"):
             env.step(np.zeros(7, np.float32))
+    finally:
+        env.close()
+
+
+def test_a_closed_drawer_that_was_put_elsewhere_is_no_success() -> None:
+    env = gymnasium.make("hal/OpenDrawer-v0").unwrapped
+    try:
+        x, y = env.centre
+        env.reset(seed=1, options={"poses": {"drawer": hal.Pose([x - 0.05, y, 0.0])}})
+        ends = [env.step(env.move(np.zeros(4), -1.0)) for _ in range(3)]
+        assert not any(info["success"] for *_, info in ends)
+        assert env.measure_opening() == pytest.approx(0.0, abs=1e-3)
+    finally:
+        env.close()
+
+
+def test_a_hidden_object_is_named_and_pays_nothing_wherever_it_was_seen_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    goal = hal.Pose([0.5, 0.0, 0.025])
+    seen = {"cube": goal}
+    monkeypatch.setattr(DepthJudge, "find", lambda *_: dict(seen))
+    env = gymnasium.make("hal/PickCube-v0", judge="depth").unwrapped
+    try:
+        still = env.move(np.zeros(4), -1.0)
+        env.reset(seed=0, options={"poses": {"cube": goal, "goal": goal}})
+        _, reward, done, _, info = env.step(still)
+        assert (reward, done, "hidden" in info) == (0.0, True, False)
+        seen.clear()
+        _, reward, done, _, info = env.step(still)
+        assert (reward, done, info["success"], info["hidden"]) == (-1.0, False, False, ["cube"])
+    finally:
+        env.close()
+
+
+def test_a_script_ends_where_it_does_not_arrive() -> None:
+    env = gymnasium.make("hal/PushCube-v0", rate_hz=5.0).unwrapped
+    try:
+        env.reset(seed=0)
+        way = env.go((0.5, 0.0, 2.0), 0.0, -1.0)
+        with pytest.raises(hal.CommandError, match=r"\(0.5, 0.0, 2.0\) m within 15 s"):
+            for steps in range(100):  # noqa: B007
+                next(way)
+        assert steps == 75
     finally:
         env.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,37 @@ def test_seeds_and_resets_of_some_worlds(envs: RigVectorEnv) -> None:
             envs.reset(**wrong)
     with raises_code(hal.CommandError, "bad_action"):
         envs.step(np.zeros(7, np.float32))
+
+
+def make_bare() -> type[gymnasium.Env]:
+    class Bare(gymnasium.Env):
+        """An environment without a rig."""
+
+        observation_space = gymnasium.spaces.Dict({"x": gymnasium.spaces.Box(0.0, 1.0)})
+        action_space = gymnasium.spaces.Box(0.0, 1.0)
+
+        def reset(self, **_: Any) -> Any:
+            return {"x": np.zeros(1, np.float32)}, {}
+
+        def step(self, action: Any) -> Any:
+            return {"x": np.ones(1, np.float32)}, 1.0, False, False, {}
+
+    return Bare
+
+
+def test_an_environment_may_have_no_rig_and_a_rig_is_none() -> None:
+    envs = make_vec(make_bare(), 2, processes=1)
+    try:
+        envs.reset()
+        seen, rewards, *_, infos = envs.step(envs.action_space.sample())
+        assert (seen["x"].tolist(), rewards.tolist()) == ([[1.0], [1.0]], [1.0, 1.0])
+        assert np.isnan(infos["elapsed"]).all()
+    finally:
+        envs.close()
+    for rig in ({"robots": {}}, Path("rig.yaml")):
+        with pytest.raises(hal.CommandError, match=r"make_vec\(RigEnv, 4, rig=[{P]") as caught:
+            make_vec(rig, 2)  # type: ignore[arg-type]
+        assert caught.value.code == "unknown_environment"
 
 
 def test_an_error_in_one_world_names_it_and_a_reset_starts_again(envs: RigVectorEnv) -> None:

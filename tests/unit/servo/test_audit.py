@@ -81,6 +81,30 @@ def test_torques_are_judged_by_their_limits_and_their_rate_from_none_on() -> Non
     assert peaks["position"] == 0.0, "where such an arm goes was not commanded"
 
 
+@pytest.mark.parametrize("before", range(125, 131))
+def test_a_leap_between_torques_shows_wherever_a_batch_of_them_ends(before: int) -> None:
+    audit = SetpointAudit(WITH_TORQUES, DT)
+    for k in range(before):
+        audit.add_setpoint(torques(0.1 * k, 0.0))
+    audit.add_setpoint(torques(0.1 * before + 3.0, 0.0))
+    for _ in range(200):
+        audit.add_setpoint(torques(0.1 * before + 3.0, 0.0))
+    peaks = audit.peaks()
+    assert peaks["torque_rate"] == pytest.approx(3.1 / DT / 1000.0)
+    assert peaks["torque"] == pytest.approx((0.1 * before + 3.0) / 20.0)
+
+
+def test_a_reset_amid_torques_judges_what_came_and_begins_from_none() -> None:
+    audit = SetpointAudit(WITH_TORQUES, DT)
+    for k in range(10):
+        audit.add_setpoint(torques(0.5 * k, 0.0))
+    audit.reset()
+    audit.add_setpoint(torques(2.0, 0.0))
+    peaks = audit.peaks()
+    assert peaks["torque"] == pytest.approx(4.5 / 20.0), "the last one before the reset"
+    assert peaks["torque_rate"] == pytest.approx(2.0 / DT / 1000.0), "from none, not from those before"
+
+
 def test_positions_after_torques_begin_a_new_stream() -> None:
     audit = SetpointAudit(WITH_TORQUES, DT)
     for _ in range(10):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -19,6 +19,7 @@ from hal.drivers.mock.robot import MockRobot
 from hal.errors import Fault
 from hal.kinematics.collision_model import CollisionModel
 from hal.servo.collisions import CollisionGuard
+from hal.servo.controllers import JointImpedance
 from hal.servo.servo import Servo
 from hal.specs import BoxSpec, CollisionSpec, WorkspaceSpec
 from hal.types import Limited, RobotStatus, Trip
@@ -120,6 +121,28 @@ class TestFollowing:
         refused = arm.send(values)
         arm.tick()
         assert arm.servo.report.refused == refused
+
+    def test_a_driver_may_change_the_lists_that_it_returned(self) -> None:
+        def inertia(q: Sequence[float]) -> np.ndarray:
+            return np.diag([2.0 + math.sin(10.0 * x) for x in q])
+
+        def driven(tamper: Callable[[Reading], Reading]) -> list[Setpoint]:
+            arm = wheels(mass_matrix=inertia, controller=JointImpedance(stiffness=50.0))
+            arm.tamper = tamper
+            for _ in range(100):
+                arm.send([0.3] * N, Kind.JOINT_VELOCITY)
+                arm.tick()
+            assert arm.by_torques
+            return arm.given
+
+        q, dq = [0.0] * N, [0.0] * N
+
+        def in_place(reading: Reading) -> Reading:
+            q[:], dq[:] = reading.q, reading.dq
+            return reading._replace(q=q, dq=dq)
+
+        for given, expected in zip(driven(in_place), driven(lambda reading: reading), strict=True):
+            assert given.tau == pytest.approx(expected.tau, abs=0.1), "the inertia may be that of a tick later"
 
 
 class TestStopping:
