@@ -159,9 +159,7 @@ class SharedWorld(WorldDriver):
             raise
 
     def _connect(self, timeout: float) -> None:
-        self._requests, answer = Connection.connect(
-            self._address, timeout, role="requests", scene=scene_of(self.spec)
-        )
+        self._requests, answer = Connection.connect(self._address, timeout, role="requests", scene=scene_of(self.spec))
         self.warnings = [
             *answer["warnings"],
             "the objects are those of the emulator's world, which goes on without this rig",

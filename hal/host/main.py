@@ -231,8 +231,6 @@ class HostProcess:
         # A fast servo publishes less often than it ticks: no reader could follow.
         self._state_every = max(1, round(spec.rate_hz / STATES_HZ))
         self._snapshot_every = max(1, round(spec.rate_hz / SNAPSHOTS_HZ))
-        self._version: tuple[int, int] | None = None
-        """Of the world in the newest snapshot."""
         self.closing = False
         self._ended_by = 0
         """Number of the signal that ends this process; 0 for none."""
@@ -343,9 +341,7 @@ class HostProcess:
             cycle.publish(now)
         if self.snapshots is not None and cycle.ticks % self._snapshot_every == 0:
             world = cycle.world
-            if world.version != self._version:  # else pictures would seem new
-                self._version = world.version
-                self.snapshots.write(world.stamp(now), world.revision, world.snapshot())
+            self.snapshots.write(world.stamp(now), world.revision, world.snapshot())
         clock_now = self.pace.now()
         for unit in cycle.arms.values():
             unit.note_latency(clock_now)
