@@ -76,7 +76,7 @@ class Connection:
             try:
                 sock.connect(address)
             except OSError as error:
-                raise ConnectionLost(f"no emulator shares its world: {error}") from None
+                raise ConnectionLost(f"no emulator shares its world ({error}): start the emulators") from None
             made.send(greeting)
             answer = made.receive()
             if "error" in answer:
@@ -93,7 +93,7 @@ class Connection:
         except BlockingIOError:
             pass  # the other side is behind: it gets a newer one
         except OSError as error:
-            raise ConnectionLost(f"the emulator's world is gone: {error}") from None
+            raise ConnectionLost(f"the emulators' world is gone ({error}): start the emulators again") from None
 
     def receive(self) -> Any:
         """Return the next message; None if the socket does not wait and there is none. Raises ConnectionLost."""
@@ -101,10 +101,12 @@ class Connection:
             data = self.sock.recv(_LARGEST)
         except BlockingIOError:
             return None
+        except TimeoutError:
+            raise ConnectionLost("the emulators' world does not answer") from None
         except OSError as error:
-            raise ConnectionLost(f"the emulator's world does not answer: {error}") from None
+            raise ConnectionLost(f"the emulators' world is gone ({error}): start the emulators again") from None
         if not data:
-            raise ConnectionLost("the emulator's world is gone")
+            raise ConnectionLost("the emulators' world is gone: start the emulators again")
         return json.loads(data)
 
     def receive_newest(self) -> Any:
@@ -146,7 +148,7 @@ class SharedWorld(WorldDriver):
         self._number = 0
         """Of the newest request."""
         self._next_try = 0.0
-        self._lost = ""
+        self._lost = "the world is closed"
         """Why it is not joined."""
         self._join(_PATIENCE)
 
@@ -207,7 +209,7 @@ class SharedWorld(WorldDriver):
 
     def _ask(self, method: str, params: Mapping[str, Any]) -> Any:
         if self._requests is None:
-            raise ConnectionLost(f"{self._lost}; start the emulator again, with this rig")
+            raise ConnectionLost(self._lost)
         self._number += 1
         self._requests.send({"id": self._number, "method": method, "params": dict(params)})
         answer = self._requests.receive()

@@ -166,7 +166,7 @@ def test_a_world_that_is_gone_shows_no_new_pictures() -> None:
         emulator.execute("kill")
         with pytest.raises(hal.StaleStateError):
             camera.read(after=rig.clock.now() + 0.5)
-        with pytest.raises(hal.ConnectionLost, match="start the emulator again"):
+        with pytest.raises(hal.ConnectionLost, match="start the emulators"):
             rig.world.pose("floor")
 
 

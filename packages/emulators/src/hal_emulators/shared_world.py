@@ -67,8 +67,7 @@ class ArmInWorld:
             answer = self._connection.receive_newest()
         except ConnectionLost as error:  # nothing is between the fingers any more
             self.close()
-            text = "the fingers meet no objects, and cameras show none; start all emulators of this rig again"
-            print(f"warning: {error}: {text}", file=sys.stderr, flush=True)
+            print(f"warning: {error}; until then the fingers meet no objects", file=sys.stderr, flush=True)
             return
         if answer is not None:
             self.object_width = answer["object"]

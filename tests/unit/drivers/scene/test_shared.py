@@ -102,6 +102,19 @@ def test_a_lost_world_is_joined_again_with_its_edits(spec: WorldSpec, monkeypatc
             assert world.revision == 1
 
 
+def test_an_arm_that_loses_the_world_says_so_and_harms_no_other(
+    spec: WorldSpec, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serve(spec), contextlib.closing(join(spec)) as world:
+        arm = ArmInWorld(address_of(spec.robots[0]), "arm")
+        arm.object_width = 0.03
+        wait_until(lambda: arm.exchange(0.01, [0.0]) or arm.object_width is None, "it is dropped for one joint of six")
+        found = capsys.readouterr().err
+        assert "ValueError: arm: 1 joint positions, not 6" in found
+        assert len([line for line in found.splitlines() if "start the emulators again; until then" in line]) == 1
+        assert world.request("names", {}) == ["floor", "arm"]
+
+
 def test_a_late_answer_is_not_taken_for_the_next(spec: WorldSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared, "_PATIENCE", 0.3)
     with serve(spec) as server, contextlib.closing(join(spec)) as world:
