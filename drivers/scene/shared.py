@@ -28,7 +28,7 @@ _PATIENCE = 10.0
 """Longest wait for the answer to a request, s."""
 _AGAIN = 1.0
 """Time between two tries to join again, s."""
-_PATIENCE_AGAIN = 0.2
+_PATIENCE_AGAIN = 1.0
 """Longest wait for an answer at such a try, s: the process of the simulation stands still meanwhile."""
 
 
