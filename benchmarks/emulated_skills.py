@@ -51,8 +51,8 @@ class Bench(NamedTuple):
     host: str = ""
 
 
-def box(depth: float, height: float, mass: float) -> dict[str, Any]:
-    """Return the entry of a cube that is 30 mm wide."""
+def make_cube(depth: float, height: float, mass: float) -> dict[str, Any]:
+    """Return the entry of a cube, or a box, that is 30 mm wide: depth and height, m, and mass, kg."""
     half, at = [depth / 2, 0.015, height / 2], [0.0, 0.0, 0.601 + height / 2]
     return {
         "name": "cube",
@@ -65,9 +65,9 @@ def box(depth: float, height: float, mass: float) -> dict[str, Any]:
 
 
 BENCHES = {
-    "FR3": Bench("franka_emulator", box(0.06, 0.06, 2.0), (-0.15, -0.2), (0.05, 0.2), np.pi, "127.0.8.2"),
-    "YAM": Bench("yam_emulator", box(0.04, 0.04, 0.3), (-0.14, -0.12), (-0.02, 0.12), 0.4),
-    "PiPER": Bench("piper_emulator", box(0.04, 0.04, 0.3), (-0.14, -0.12), (-0.02, 0.12), np.pi),
+    "FR3": Bench("franka_emulator", make_cube(0.06, 0.06, 2.0), (-0.15, -0.2), (0.05, 0.2), np.pi, "127.0.8.2"),
+    "YAM": Bench("yam_emulator", make_cube(0.04, 0.04, 0.3), (-0.14, -0.12), (-0.02, 0.12), 0.4),
+    "PiPER": Bench("piper_emulator", make_cube(0.04, 0.04, 0.3), (-0.14, -0.12), (-0.02, 0.12), np.pi),
 }
 
 
@@ -83,7 +83,7 @@ class Try(NamedTuple):
 
 
 @contextlib.contextmanager
-def opened(bench: Bench, engine: str, emulated: bool, *options: str) -> Iterator[hal.Rig]:
+def open_bench(bench: Bench, engine: str, emulated: bool, *options: str) -> Iterator[hal.Rig]:
     """Open the rig of a bench, in simulation or with its emulator."""
     sets = [f"objects=[floor, table, {flow(bench.cube)}]", f"simulation.engine={engine}"]
     if not emulated:
@@ -168,7 +168,7 @@ def run(quick: bool) -> Iterator[Table]:
     table = Table(f"pick and place, {tries} tries each, engine {ENGINES[0]}", columns)
     for name, bench in list(BENCHES.items())[: 1 if quick else 3]:
         for how, emulated in (("simulated", False), ("emulated", True)):
-            with opened(bench, ENGINES[0], emulated, "--lockstep") as rig:
+            with open_bench(bench, ENGINES[0], emulated, "--lockstep") as rig:
                 found = list(pick_and_place(rig, bench, tries))
             widths = [1e3 * each.width for each in found if not each.reason] or [np.nan]
             off = [1e3 * each.off for each in found if not each.reason] or [np.nan]

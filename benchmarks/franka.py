@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import hal
-from hal_emulators.franka.control import EmulatorControl
+from hal_emulators.control import EmulatorControl
 
 from .kit import Table, emulated_franka, ticks_missed
 

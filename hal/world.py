@@ -515,6 +515,10 @@ class WorldDriver(ABC):
     def version(self) -> tuple[int, int]:
         """Changes whenever anything may look different: after a step, an edit or a reset."""
 
+    def stamp(self, now: float) -> float:
+        """Return the time of the present state on the group's clock, s; ``now`` is that of the cycle that ends."""
+        return now
+
     @abstractmethod
     def step(self) -> None:
         """Advance the world by :attr:`dt`."""

@@ -15,12 +15,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from hal.errors import ConfigError, ConnectionLost, Problem
+from hal.errors import ConfigError, ConnectionLost, HalError, Problem
 from hal.host.process import unpack_error
 from hal.specs import RobotSpec, WorldSpec, to_json
 from hal.world import WorldDriver
 
-__all__ = ["Connection", "SharedWorld", "address_of", "join_world", "scene_of"]
+__all__ = ["Connection", "SharedWorld", "address_of", "check_scene", "join_world", "scene_of"]
 
 _LARGEST = 1 << 20
 """Largest message, bytes."""
@@ -28,6 +28,8 @@ _PATIENCE = 10.0
 """Longest wait for the answer to a request, s."""
 _AGAIN = 1.0
 """Time between two tries to join again, s."""
+_PATIENCE_AGAIN = 1.0
+"""Longest wait for an answer at such a try, s: the process of the simulation stands still meanwhile."""
 
 
 def address_of(robot: RobotSpec) -> str:
@@ -52,18 +54,37 @@ class Connection:
         self.sock = sock
 
     @classmethod
-    def to(cls, address: str, **greeting: Any) -> Connection:
-        """Connect, and say what for. Raises ConnectionLost if there is no such program."""
+    def connect(cls, address: str, timeout: float, **greeting: Any) -> tuple[Connection, Any]:
+        """Connect, and say what for.
+
+        Args:
+            address: Of the world.
+            timeout: Longest wait for an answer, now and later, s.
+            **greeting: ``role``, and what the program has to know of a client of this kind.
+
+        Returns:
+            The connection, and the program's answer.
+
+        Raises:
+            ConnectionLost: There is no such program, or it does not answer.
+            HalError: It refuses this client, with its reason.
+        """
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        sock.settimeout(_PATIENCE)
-        try:
-            sock.connect(address)
-        except OSError as error:
-            sock.close()
-            raise ConnectionLost(f"no emulator shares its world: {error}") from None
+        sock.settimeout(timeout)
         made = cls(sock)
-        made.send(greeting)
-        return made
+        try:
+            try:
+                sock.connect(address)
+            except OSError as error:
+                raise ConnectionLost(f"no emulator shares its world ({error}): start the emulators") from None
+            made.send(greeting)
+            answer = made.receive()
+            if "error" in answer:
+                raise unpack_error(answer["error"])
+        except BaseException:
+            made.close()
+            raise
+        return made, answer
 
     def send(self, message: Any) -> None:
         """Send a message. Raises ConnectionLost."""
@@ -72,7 +93,7 @@ class Connection:
         except BlockingIOError:
             pass  # the other side is behind: it gets a newer one
         except OSError as error:
-            raise ConnectionLost(f"the emulator's world is gone: {error}") from None
+            raise ConnectionLost(f"the emulators' world is gone ({error}): start the emulators again") from None
 
     def receive(self) -> Any:
         """Return the next message; None if the socket does not wait and there is none. Raises ConnectionLost."""
@@ -80,10 +101,12 @@ class Connection:
             data = self.sock.recv(_LARGEST)
         except BlockingIOError:
             return None
+        except TimeoutError:
+            raise ConnectionLost("the emulators' world does not answer") from None
         except OSError as error:
-            raise ConnectionLost(f"the emulator's world does not answer: {error}") from None
+            raise ConnectionLost(f"the emulators' world is gone ({error}): start the emulators again") from None
         if not data:
-            raise ConnectionLost("the emulator's world is gone")
+            raise ConnectionLost("the emulators' world is gone: start the emulators again")
         return json.loads(data)
 
     def receive_newest(self) -> Any:
@@ -102,47 +125,67 @@ class SharedWorld(WorldDriver):
     """The world that the emulators of a rig's arms share, as the rig's own process of the simulation has it.
 
     It is stepped elsewhere: :meth:`step` takes its newest state, and requests are passed on. If the emulator ends, the
-    last state stays, and the world is joined again when there is one.
+    last state stays, and the world is joined again when there is one; until then requests raise ConnectionLost, with
+    the reason.
     """
 
     def __init__(self, spec: WorldSpec, address: str) -> None:
-        """Raises ConnectionLost if no emulator shares a world, and ConfigError if its scene is another one."""
+        """Join the world.
+
+        Raises:
+            ConnectionLost: No emulator shares a world.
+            ControlTaken: Another program has it.
+            ConfigError: Its scene is another one.
+        """
         super().__init__(spec)
         self._address = address
         self._edits: list[tuple[str, dict[str, Any]]] = []
         self._on_edit: list[Callable[[str, dict[str, Any], int], None]] = []
         self._values: list[float] = []
+        self._stamp = 0.0
         self._requests: Connection | None = None
         self._poses: Connection | None = None
+        self._number = 0
+        """Of the newest request."""
         self._next_try = 0.0
-        self._join()
+        self._lost = "the world is closed"
+        """Why it is not joined."""
+        self._join(_PATIENCE)
 
-    def _join(self) -> None:
-        self._requests = Connection.to(self._address, role="requests")
-        told = self._requests.receive()
-        own = scene_of(self.spec)
-        if told["scene"] != own:
+    def _join(self, timeout: float) -> None:
+        """Join the world, and repeat this rig's edits there; ``timeout`` (s) is for each answer."""
+        try:
+            self._connect(timeout)
+        except HalError:
             self.close()
-            raise ConfigError([_other_scene(own, told["scene"])])
+            raise
+
+    def _connect(self, timeout: float) -> None:
+        self._requests, answer = Connection.connect(self._address, timeout, role="requests", scene=scene_of(self.spec))
         self.warnings = [
-            *told["warnings"],
+            *answer["warnings"],
             "the objects are those of the emulator's world, which goes on without this rig",
         ]
         for method, params in self._edits:
             self._ask(method, params)
         self.steps = 0
-        self._poses = Connection.to(self._address, role="poses")
-        self._take(self._poses.receive())
+        self._poses, state = Connection.connect(self._address, timeout, role="poses")
+        self._take(state)
         self._poses.sock.setblocking(False)
+        self._requests.sock.settimeout(_PATIENCE)
 
     def _take(self, state: Mapping[str, Any]) -> None:
         """Take a state of the world, unless a later one came with an answer."""
         if state["steps"] >= self.steps:
             self.steps, self.revision, self._values = state["steps"], state["revision"], state["snapshot"]
+            self._stamp = state["t"]
 
     @property
     def version(self) -> tuple[int, int]:
         return self.steps, self.revision
+
+    def stamp(self, now: float) -> float:
+        return self._stamp
 
     def step(self) -> None:
         try:
@@ -151,10 +194,10 @@ class SharedWorld(WorldDriver):
                 if newest is not None:
                     self._take(newest)
             elif time.monotonic() >= self._next_try:
-                self._next_try = time.monotonic() + _AGAIN
-                self._join()
-        except ConnectionLost:
+                self._join(_PATIENCE_AGAIN)
+        except HalError as error:  # also another scene, or another program that was faster
             self.close()
+            self._lost, self._next_try = str(error), time.monotonic() + _AGAIN
 
     def request(self, method: str, params: Mapping[str, Any]) -> Any:
         result = self._ask(method, params)
@@ -166,9 +209,12 @@ class SharedWorld(WorldDriver):
 
     def _ask(self, method: str, params: Mapping[str, Any]) -> Any:
         if self._requests is None:
-            raise ConnectionLost("the emulator's world is gone: start the emulator again")
-        self._requests.send({"method": method, "params": dict(params)})
+            raise ConnectionLost(self._lost)
+        self._number += 1
+        self._requests.send({"id": self._number, "method": method, "params": dict(params)})
         answer = self._requests.receive()
+        while answer["id"] != self._number:  # of a request that was given up
+            answer = self._requests.receive()
         if "error" in answer:
             raise unpack_error(answer["error"])
         self._take(answer["state"])
@@ -199,15 +245,19 @@ class SharedWorld(WorldDriver):
         self._requests = self._poses = None
 
 
-def _other_scene(own: Mapping[str, Any], told: Mapping[str, Any]) -> Problem:
+def check_scene(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+    """Raise ConfigError, with the names of what differs, if the scene of a program is not that of the emulator."""
+    if own == other:
+        return
     differ = sorted(
         name
         for part in ("objects", "robots")
-        for name in {*own[part], *told[part]}
-        if own[part].get(name) != told[part].get(name)
+        for name in {*own[part], *other[part]}
+        if own[part].get(name) != other[part].get(name)
     )
     text = f"the emulator has another scene ({', '.join(differ) or 'another gravity'})"
-    return Problem("simulation", "objects", f"{text}: start it with this rig (--config, --set)", "other_scene")
+    text += ": start it with this rig (--config, --set)"
+    raise ConfigError([Problem("simulation", "objects", text, "other_scene")])
 
 
 def join_world(spec: WorldSpec) -> SharedWorld | None:
@@ -218,6 +268,3 @@ def join_world(spec: WorldSpec) -> SharedWorld | None:
         return SharedWorld(spec, address_of(spec.robots[0]))
     except ConnectionLost:
         return None
-
-
-# The emulators' side.

@@ -340,7 +340,8 @@ class HostProcess:
         if cycle.ticks % self._state_every == 0 or self.pace.pausing:
             cycle.publish(now)
         if self.snapshots is not None and cycle.ticks % self._snapshot_every == 0:
-            self.snapshots.write(now, cycle.world.revision, cycle.world.snapshot())
+            world = cycle.world
+            self.snapshots.write(world.stamp(now), world.revision, world.snapshot())
         clock_now = self.pace.now()
         for unit in cycle.arms.values():
             unit.note_latency(clock_now)

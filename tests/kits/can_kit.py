@@ -24,8 +24,8 @@ from typing import Any
 
 from hal.config.loader import load
 from hal.specs import RobotSpec
-from hal_emulators.can.console import EmulatorControl
 from hal_emulators.can.server import CanEmulator, EmulatedArm
+from hal_emulators.control import EmulatorControl
 
 __all__ = ["CanBench", "EmulatorProcess", "can_overrides", "emulated_arm"]
 
@@ -104,7 +104,7 @@ class EmulatorProcess:
             self.process.kill()
             self.process.wait()
             raise RuntimeError("the emulator did not get ready:\n" + "\n".join(self.lines))
-        self.control = EmulatorControl(int(line.split("control port ")[1].split(";")[0]))
+        self.control = EmulatorControl("127.0.0.1", int(line.split("control port ")[1].split(";")[0]))
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -116,7 +116,7 @@ class EmulatorProcess:
 
     def execute(self, line: str) -> dict[str, Any]:
         """Execute a command of the emulator's console."""
-        return self.control.execute(line)
+        return self.control.send(line)
 
     def type(self, line: str) -> None:
         """Type a line at its prompt."""

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hal.drivers.franka.flags import FLAGS
-from hal_emulators.franka.control import EmulatorControl
+from hal_emulators.control import EmulatorControl
 
 Report = dict[str, Any]
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hal_emulators.franka.control import EmulatorControl
+from hal_emulators.control import EmulatorControl
 
 __all__ = ["Client", "Emulator", "free_host", "run_client"]
 

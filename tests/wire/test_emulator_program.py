@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from hal_emulators.franka.control import EmulatorControl
+from hal_emulators.control import EmulatorControl
 
 from .franka_kit import Client, Emulator, run_client
 
@@ -63,7 +63,8 @@ def test_an_address_that_is_taken_or_foreign_is_one_line(arm: Emulator) -> None:
 
 
 def test_invalid_options_are_refused() -> None:
-    for options in (["--host", "here"], ["--patience", "0"], ["--robot", "ur5"], ["--urdf", "/nowhere.urdf"]):
+    apart = ["--config", "franka_emulator", "--lockstep", "--unpaced"]
+    for options in (["--host", "here"], ["--patience", "0"], ["--robot", "ur5"], ["--urdf", "/nowhere.urdf"], apart):
         done = subprocess.run([*PROGRAM, *options], capture_output=True, text=True, timeout=20)
         assert done.returncode != 0
         assert "Traceback" not in done.stderr

@@ -157,6 +157,19 @@ def test_fingers_on_a_bus_hold_miss_and_lose(can: Bench) -> None:
         miss_and_lose(rig)
 
 
+def test_a_world_that_is_gone_shows_no_new_pictures() -> None:
+    sets = ["objects=[floor]", f"cameras={tries.flow({'scene': tries.CAMERA})}"]
+    rig_name = "yam_emulator"
+    with EmulatorProcess(rig_name, *sets) as emulator, Bench(rig_name, emulator.overrides).open() as rig:
+        camera = rig.cameras["scene"]
+        camera.read(timeout=10.0)
+        emulator.execute("kill")
+        with pytest.raises(hal.StaleStateError):
+            camera.read(after=rig.clock.now() + 0.5)
+        with pytest.raises(hal.ConnectionLost, match="start the emulators"):
+            rig.world.pose("floor")
+
+
 def test_a_rig_with_another_scene_is_refused(fr3: Bench) -> None:
     with pytest.raises(hal.ConfigError, match="another scene") as found:
         fr3.open("objects=[floor, table]")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import subprocess
 import sys
 import time
@@ -16,6 +17,10 @@ __all__ = ["ArmInWorld", "has_world", "run_world"]
 
 _PERIOD = 0.004
 """Time between two reports of an arm, s."""
+_START = 60.0
+"""Longest time that the program of the world takes to get ready, s: the first time it reads large meshes."""
+_END = 5.0
+"""Longest time that it takes to end, s."""
 _AT_REST = 4e-6
 """Motion of a joint between two reports, rad, below which the arm counts as being at rest."""
 
@@ -30,11 +35,17 @@ class ArmInWorld:
     """
 
     def __init__(self, address: str, name: str) -> None:
-        """Raises ConnectionLost if there is no such world."""
+        """Enter the world.
+
+        Raises:
+            ConnectionLost: There is no such world.
+            ValueError: It has no arm of this name; lists those that it has.
+        """
         self.fingers: tuple[float, float] | None = None
-        self.object_width: float | None = None
-        self._connection: Connection | None = Connection.to(address, role="arm", name=name)
-        self._connection.sock.setblocking(False)
+        connection, answer = Connection.connect(address, _START, role="arm", name=name)
+        connection.sock.setblocking(False)
+        self._connection: Connection | None = connection
+        self.object_width: float | None = answer["object"]
         self._t = time.monotonic()
         """Time of the arm, s: it falls behind where the emulator is late, so that no motion in the world is faster."""
         self._due = self._t
@@ -53,12 +64,13 @@ class ArmInWorld:
         self._due = self._t + _PERIOD
         try:
             self._connection.send({"t": self._t, "q": self._q, "fingers": self.fingers})
-            told = self._connection.receive_newest()
-        except ConnectionLost:  # the program was killed: nothing is between the fingers any more
+            answer = self._connection.receive_newest()
+        except ConnectionLost as error:  # nothing is between the fingers any more
             self.close()
+            print(f"warning: {error}; until then the fingers meet no objects", file=sys.stderr, flush=True)
             return
-        if told is not None:
-            self.object_width = told["object"]
+        if answer is not None:
+            self.object_width = answer["object"]
 
     def close(self) -> None:
         """Leave the world."""
@@ -86,9 +98,15 @@ def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
+            if not select.select([process.stdout], [], [], _START)[0]:
+                raise ValueError(f"the program of the world is not ready within {_START:g} s")
             line = process.stdout.readline().strip()
             if line not in ("ready", "shared"):
                 raise ValueError(line.removeprefix("error: ") or "the program of the world ended")
             yield
         finally:
             process.stdin.close()  # it ends
+            try:
+                process.wait(_END)
+            except subprocess.TimeoutExpired:
+                process.kill()

@@ -17,6 +17,7 @@ import signal
 import socket
 import sys
 import time
+import traceback
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,8 +28,8 @@ import numpy as np
 from hal import registry
 from hal.config.loader import load
 from hal.drivers.scene.gripper import SimulatedGripper
-from hal.drivers.scene.shared import Connection, address_of, scene_of
-from hal.errors import ConnectionLost, HalError
+from hal.drivers.scene.shared import Connection, address_of, check_scene, scene_of
+from hal.errors import CommandError, ConnectionLost, ControlTaken, HalError
 from hal.host.process import pack_error
 from hal.specs import RobotSpec, WorldSpec
 
@@ -56,6 +57,7 @@ class ArmOfWorld:
     def __init__(self, world: Any, spec: RobotSpec) -> None:
         self._world = world
         self.name = spec.name
+        self._joints = len(spec.joints)
         self.object_width: float | None = None
         """Width of the fingers on what is between them, m; None for nothing."""
         self._reports: deque[tuple[float, list[float]]] = deque()
@@ -79,7 +81,9 @@ class ArmOfWorld:
             ]
 
     def take(self, report: Mapping[str, Any]) -> None:
-        """Take a report of the emulator."""
+        """Take a report of the emulator. Raises ValueError if it is one of an arm with other joints."""
+        if len(report["q"]) != self._joints:
+            raise ValueError(f"{self.name}: {len(report['q'])} joint positions, not {self._joints}")
         t, self.heard = report["t"], time.monotonic()
         self.reported = t
         self._reports.append((t, report["q"]))
@@ -177,10 +181,12 @@ class WorldServer:
         self._clients: dict[int, Connection] = {}
         self._roles: dict[int, str] = {}
         self._arms_of: dict[int, ArmOfWorld] = {}
+        self._t = time.monotonic()
+        """Time of the step that was made last, s."""
         self._build()
 
     def _build(self) -> None:
-        """Make the world anew; arms keep their reports."""
+        """Make the world anew; its arms wait for a report."""
         quick = tuple(
             robot
             if robot.gripper is None
@@ -195,16 +201,15 @@ class WorldServer:
         """Step and serve until the descriptor ``until`` is closed on the other side."""
         self._poller.register(until, select.EPOLLIN | select.EPOLLHUP)
         dt = self.world.dt
-        t = self._reported(time.monotonic())
-        """Time of the step that was made last, s."""
+        self._t = self._reported(time.monotonic())
         while True:
             now = time.monotonic()
             reported = self._reported(now)
-            t = max(t, reported - _LONGEST_GAP)
-            if t + dt <= reported:
-                t += dt
-                self._step(t, dt)
-            ready = t + dt <= reported
+            self._t = max(self._t, reported - _LONGEST_GAP)
+            if self._t + dt <= reported:
+                self._t += dt
+                self._step(self._t, dt)
+            ready = self._t + dt <= reported
             for descriptor, _ in self._poller.poll(0.0 if ready else dt):
                 if descriptor == until:
                     if not os.read(until, 4096):
@@ -213,6 +218,11 @@ class WorldServer:
                     self._accept(self._listeners[descriptor])
                 else:
                     self._serve(descriptor)
+
+    def close(self) -> None:
+        """Leave all clients, and free the world and its addresses."""
+        for connection in (*self._listeners.values(), *self._clients.values(), self._poller, self.world):
+            connection.close()
 
     def _reported(self, now: float) -> float:
         """Return the time up to which the arms have reported where they are, s."""
@@ -235,7 +245,7 @@ class WorldServer:
 
     def _state(self) -> dict[str, Any]:
         world = self.world
-        return {"steps": world.steps, "revision": world.revision, "snapshot": world.snapshot()}
+        return {"t": self._t, "steps": world.steps, "revision": world.revision, "snapshot": world.snapshot()}
 
     def _send(self, descriptor: int, message: Any) -> None:
         with contextlib.suppress(ConnectionLost):  # the poller reports its end
@@ -257,38 +267,62 @@ class WorldServer:
                     self._arms_of[descriptor].take(message)
                 else:
                     client.send(self._answer(message))
-        except (ConnectionLost, KeyError, TypeError, ValueError):
-            self._poller.unregister(client.sock)
-            del self._clients[descriptor]
-            self._roles.pop(descriptor, None)
-            self._arms_of.pop(descriptor, None)
-            client.close()
+        except ConnectionLost:
+            self._drop(descriptor)
+        except Exception:  # of what this client sent: the world goes on without it
+            traceback.print_exc()
+            self._drop(descriptor)
+
+    def _drop(self, descriptor: int) -> None:
+        client = self._clients.pop(descriptor)
+        self._poller.unregister(client.sock)
+        self._roles.pop(descriptor, None)
+        self._arms_of.pop(descriptor, None)
+        client.close()
 
     def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
         """Return the answer to a request of :class:`.shared.SharedWorld`, with the state after it."""
         try:
             result = self.world.request(message["method"], message["params"])
         except Exception as error:
-            return {"error": pack_error(error)}
-        return {"result": result, "state": self._state()}
+            return {"id": message["id"], "error": pack_error(error)}
+        return {"id": message["id"], "result": result, "state": self._state()}
 
     def _greet(self, descriptor: int, message: Mapping[str, Any]) -> None:
+        """Answer the first message of a client; one that is refused is told why, and changes nothing."""
+        try:
+            answer = self._admit(descriptor, message)
+        except HalError as error:
+            answer = {"error": pack_error(error)}
+        else:
+            self._roles[descriptor] = message["role"]
+        self._send(descriptor, answer)
+
+    def _admit(self, descriptor: int, message: Mapping[str, Any]) -> dict[str, Any]:
         role = message["role"]
         if role == "arm":
-            arm = self._arms_of[descriptor] = self.arms[message["name"]]
-            self._send(descriptor, {"object": arm.object_width})
-        elif role == "requests":
-            if self.world.revision:
-                self._restart()
-            self._send(descriptor, {"scene": scene_of(self._spec), "warnings": self.world.warnings})
-        else:
-            self._send(descriptor, self._state())
-        self._roles[descriptor] = role
+            name = message["name"]
+            if name not in self.arms:
+                names = ", ".join(self.arms)
+                raise CommandError(
+                    f"the world of the emulators has no arm {name!r}, but {names}: start each with the same rig"
+                )
+            arm = self._arms_of[descriptor] = self.arms[name]
+            return {"object": arm.object_width}
+        if role == "poses":
+            return self._state()
+        if "requests" in self._roles.values():
+            raise ControlTaken("another program has this world: close it first")
+        check_scene(scene_of(self._spec), message["scene"])
+        if self.world.revision:
+            self._restart()
+        return {"warnings": self.world.warnings}
 
     def _restart(self) -> None:
         """Undo what a program that is gone added, removed and painted: the next one does not know of it."""
-        self.world.close()
+        before = self.world
         self._build()
+        before.close()
         for descriptor, arm in self._arms_of.items():
             self._arms_of[descriptor] = self.arms[arm.name]
             self._send(descriptor, {"object": None})
@@ -303,6 +337,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends it
+    emulator = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # it reads one line: what an engine writes goes to the terminal
     try:
         world = load(options.config, sim=False, overrides=options.set).resolve().world
         if world is None:
@@ -313,13 +349,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.errno != errno.EADDRINUSE:
             raise
-        print("shared", flush=True)
+        print("shared", file=emulator, flush=True)
         return 0
     except (HalError, ValueError) as error:
-        print(f"error: {' '.join(str(error).split())}", flush=True)
+        print(f"error: {' '.join(str(error).split())}", file=emulator, flush=True)
         return 1
-    print("ready", flush=True)
+    print("ready", file=emulator, flush=True)
     server.run(sys.stdin.fileno())
+    server.close()
     return 0
 
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from .server import CanEmulator, EmulatedArm, EmulatedBus
 
-__all__ = ["COMMANDS", "CommandPort", "EmulatorControl", "execute", "help_text", "serve_prompt"]
+__all__ = ["COMMANDS", "CommandPort", "execute", "help_text", "serve_prompt"]
 
 _FOREVER = 1e9
 """Stands for no end, s."""
@@ -344,44 +344,3 @@ def _answer(emulator: CanEmulator, line: str) -> dict[str, Any]:
         return {"ok": True, **execute(emulator, line.split())}
     except (ValueError, TypeError) as error:
         return {"ok": False, "error": str(error)}
-
-
-class EmulatorControl:
-    """A connection to the control port of a running emulator, also as a context manager."""
-
-    def __init__(self, port: int, timeout: float = 10.0) -> None:
-        """Connect. Raises OSError if there is no emulator at this port."""
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout)
-        self._reader = self._socket.makefile("r", encoding="utf-8")
-
-    def execute(self, line: str) -> dict[str, Any]:
-        """Execute a command and return its answer; empty after ``kill``.
-
-        Raises:
-            ValueError: The emulator refuses the command.
-            ConnectionError: The emulator has ended.
-        """
-        self._socket.sendall(line.encode() + b"\n")
-        try:
-            text = self._reader.readline()
-        except ConnectionError:
-            text = ""
-        if not text and line.strip().endswith("kill"):
-            return {}
-        if not text:
-            raise ConnectionError("the emulator has ended")
-        answer: dict[str, Any] = json.loads(text)
-        if not answer.pop("ok"):
-            raise ValueError(answer["error"])
-        return answer
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._reader.close()
-        self._socket.close()
-
-    def __enter__(self) -> EmulatorControl:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

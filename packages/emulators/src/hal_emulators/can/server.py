@@ -271,7 +271,7 @@ class CanEmulator:
             overrides: Changes of it, as for :func:`hal.open`.
             seed: Of random losses.
             realtime: Give its threads the priority of a servo, for a process that does nothing else.
-            in_world: Put the arms into the simulated world that :func:`hal.drivers.scene.shared.run_world` runs.
+            in_world: Put the arms into the simulated world that :func:`hal_emulators.shared_world.run_world` runs.
 
         Raises:
             ConfigError: The rig has problems.

@@ -16,11 +16,11 @@ from hal.config.loader import load
 from hal.drivers.franka.limits import LIMITS
 from hal.drivers.scene.shared import address_of
 from hal.errors import HalError
+from hal_emulators.control import CONTROL_PORT
 from hal_emulators.shared_world import ArmInWorld, run_world
 
 from .arm import EmulatedArm, RobotFiles
 from .console import CommandConsole, Executor
-from .control import CONTROL_PORT
 from .faults import help_text
 from .journal import Journal
 from .model_library import write_model_library
@@ -153,6 +153,8 @@ def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | 
     """Return the arm's place in the simulated world of the rig; None without a rig. Raises ValueError."""
     if options.config is None:
         return None
+    if options.unpaced:
+        raise ValueError("--config does not go with --unpaced: an app in simulated time has a world of its own")
     rig = load(options.config, sim=False, overrides=options.set).resolve()
     arm = next((arm for arm in rig.robots if arm.driver == "franka" and arm.options.get("host") == options.host), None)
     if arm is None:

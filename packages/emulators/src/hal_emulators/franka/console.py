@@ -19,8 +19,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from hal.drivers.franka.flags import flag_index
+from hal_emulators.control import CONTROL_PORT
 
-from .control import CONTROL_PORT
 from .faults import COMMANDS, help_text
 from .journal import Counters
 from .server import ArmServer, listen
