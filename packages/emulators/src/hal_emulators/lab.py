@@ -1,0 +1,150 @@
+"""Everything that a rig names as real, emulated by one command with one prompt: ``hal emulate --config RIG``."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from hal.config.loader import load
+from hal.specs import RobotSpec
+from hal_emulators.shared_world import has_world
+
+_END = 10.0
+"""Longest time that the emulators take to end, s."""
+_PR_SET_PDEATHSIG = 1
+_FRANKA = {"fr3": "fr3", "fer": "panda"}
+"""Arm of a Franka's settings -> robot of its emulator."""
+
+
+class Emulator(NamedTuple):
+    """An emulator of a rig."""
+
+    name: str
+    """At the prompt: that of the arm, or of the program that plays several."""
+    arguments: list[str]
+    """Of ``hal emulate``."""
+
+
+def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]:
+    """Return the emulators of a rig.
+
+    Args:
+        config: The rig: a name in ``config/``, or a path.
+        overrides: Changes to it, ``KEY=VALUE``.
+
+    Raises:
+        ConfigError: The rig is not valid.
+        ValueError: A device is not at an address of this computer, or nothing is real.
+    """
+    rig = load(config, sim=False, overrides=overrides).resolve()
+    words = ["--config", config, *(word for value in overrides for word in ("--set", value))]
+    foreign = [arm.name for arm in rig.robots if arm.attended and not arm.emulated]
+    if foreign:
+        raise ValueError(f"{', '.join(foreign)}: not at an address of an emulator; change real: in the rig, or by --set")
+    in_world = has_world(config, overrides)
+    emulators = {}
+    for arm in rig.robots:
+        for device in (arm, arm.gripper):
+            if device is not None:
+                made = _emulator_of(device.driver, arm, words, in_world)
+                if made is not None:
+                    emulators[made.name] = made
+    if not emulators:
+        raise ValueError(f"{config} names no real arm or gripper that has an emulator")
+    return list(emulators.values())
+
+
+def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) -> Emulator | None:
+    if driver in ("damiao", "piper"):
+        return Emulator("can", ["can", *words])
+    if driver == "robotiq":
+        return Emulator("robotiq", ["robotiq", *words])
+    host = ["--host", str(arm.options.get("host"))]
+    if driver == "ur":
+        return Emulator(arm.name, ["ur", "--robot", arm.model, *host])
+    if driver == "franka" and arm.driver == driver:
+        bare = arm.gripper is None or arm.gripper.driver != driver
+        hand = ["--end-effector", "none", "--no-hand"] if bare else []
+        world = words if in_world else []
+        return Emulator(arm.name, ["franka", "--robot", _FRANKA[arm.options["arm"]], *host, *hand, *world])
+    return None
+
+
+def run_lab(config: str, overrides: Sequence[str] = ()) -> int:
+    """Run the emulators of a rig until one ends or the program is asked to end; return the exit status.
+
+    A line of standard input goes to the emulator whose name it begins with, or to the only one.
+
+    Raises:
+        ConfigError, ValueError: As :func:`list_emulators`.
+    """
+    end = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: end.set())
+    emulators = list_emulators(config, overrides)
+    failed = False
+    with contextlib.ExitStack() as stack:
+        running = {emulator.name: stack.enter_context(_start(emulator)) for emulator in emulators}
+        stack.callback(_end_all, list(running.values()))
+        print(f"starting {', '.join(running)}; NAME help lists the commands of one, Ctrl-C ends all", flush=True)
+        for name, process in running.items():
+            threading.Thread(target=_print_lines, args=(name, process), name=name, daemon=True).start()
+        threading.Thread(target=_serve_prompt, args=(running,), name="prompt", daemon=True).start()
+        while not end.wait(0.1):
+            ended = [name for name, process in running.items() if process.poll() is not None]
+            if ended:
+                print(f"error: {', '.join(ended)} ended, so all do", file=sys.stderr, flush=True)
+                failed = True
+                break
+    return int(failed)
+
+
+def _start(emulator: Emulator) -> subprocess.Popen[str]:
+    """Start an emulator, which ends with this program however this ends, and not at its terminal's Ctrl-C."""
+    libc = ctypes.CDLL(None)
+    return subprocess.Popen(
+        [sys.executable, "-m", f"hal_emulators.{emulator.arguments[0]}", *emulator.arguments[1:]],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
+    )
+
+
+def _end_all(processes: Sequence[subprocess.Popen[str]]) -> None:
+    for process in processes:
+        process.terminate()
+    limit = time.monotonic() + _END
+    for process in processes:
+        try:
+            process.wait(max(0.0, limit - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+def _print_lines(name: str, process: subprocess.Popen[str]) -> None:
+    for line in process.stdout or ():
+        print(f"{name}: {line.rstrip()}", flush=True)
+
+
+def _serve_prompt(running: dict[str, subprocess.Popen[str]]) -> None:
+    for line in sys.stdin:
+        name, _, command = line.strip().partition(" ")
+        if len(running) == 1 and name not in running:
+            (name,), command = running, line.strip()
+        if name not in running:
+            print(f"begin with the name of an emulator: {', '.join(running)}", flush=True)
+            continue
+        stdin = running[name].stdin
+        assert stdin is not None
+        with contextlib.suppress(OSError):
+            print(command or "help", file=stdin, flush=True)
