@@ -1,4 +1,4 @@
-"""A whole laboratory with one command: every arm of a rig emulated, driven through ``hal.open``, with faults by name."""
+"""A whole laboratory with one command: every arm of a rig emulated, driven by ``hal.open``, with faults by name."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
     words = ["--config", config, *(word for value in overrides for word in ("--set", value))]
     foreign = [arm.name for arm in rig.robots if arm.attended and not arm.emulated]
     if foreign:
-        raise ValueError(f"{', '.join(foreign)}: not at an address of an emulator; change real: in the rig, or by --set")
+        raise ValueError(f"{', '.join(foreign)}: not at an address of an emulator: change real: there, or --set it")
     in_world = has_world(config, overrides)
     emulators = {}
     for arm in rig.robots:
