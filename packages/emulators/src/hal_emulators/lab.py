@@ -85,9 +85,9 @@ def run_lab(config: str, overrides: Sequence[str] = ()) -> int:
     Raises:
         ConfigError, ValueError: As :func:`list_emulators`.
     """
-    end = threading.Event()
+    ends: list[int] = []  # not an Event: a second signal within its set() would wait for ever
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: end.set())
+        signal.signal(number, lambda number, _: ends.append(number))
     emulators = list_emulators(config, overrides)
     failed = False
     with contextlib.ExitStack() as stack:
@@ -97,7 +97,8 @@ def run_lab(config: str, overrides: Sequence[str] = ()) -> int:
         for name, process in running.items():
             threading.Thread(target=_print_lines, args=(name, process), name=name, daemon=True).start()
         threading.Thread(target=_serve_prompt, args=(running,), name="prompt", daemon=True).start()
-        while not end.wait(0.1):
+        while not ends:
+            time.sleep(0.1)
             ended = [name for name, process in running.items() if process.poll() is not None]
             if ended:
                 print(f"error: {', '.join(ended)} ended, so all do", file=sys.stderr, flush=True)

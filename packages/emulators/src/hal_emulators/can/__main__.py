@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import signal
 import sys
-import threading
+import time
 from collections.abc import Sequence
 
 try:
@@ -47,18 +47,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="leave out the rig's simulated world: the fingers meet only what the command `object` names",
     )
     options = parser.parse_args(arguments)
-    end = threading.Event()
+    ends: list[int] = []  # not an Event: a second signal within its set() would wait for ever
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: end.set())
+        signal.signal(number, lambda number, _: ends.append(number))
     try:
-        _run(options, end)
+        _run(options, ends)
     except (HalError, can.CanError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _run(options: argparse.Namespace, end: threading.Event) -> None:
+def _run(options: argparse.Namespace, ends: list[int]) -> None:
     with contextlib.ExitStack() as stack:
         in_world = not options.no_world and has_world(options.config, options.set)
         if in_world:
@@ -70,7 +70,8 @@ def _run(options: argparse.Namespace, end: threading.Event) -> None:
             names = ", ".join(f"{arm.name} at {' '.join(arm.bus.key)}" for arm in emulator.arms.values())
             print(f"ready: {names}; control port {port.number}; help lists the commands", flush=True)
             serve_prompt(emulator)
-            while not end.wait(0.2):
+            while not ends:
+                time.sleep(0.1)
                 for bus in emulator.buses:
                     if bus.error is not None:
                         raise bus.error
