@@ -1,4 +1,4 @@
-"""Cameras without a library of their own: on Video4Linux2 (webcams, capture cards), and videos from a file or a network.
+"""Cameras without a library of their own: webcams on Video4Linux2, and videos from a file or a network.
 
 See docs/cameras.md.
 """

@@ -234,10 +234,10 @@ def _set_mode(node: VideoNode, spec: CameraSpec) -> PictureDecoder:
         if (got.width, got.height, got.pixelformat) != (width, height, pixels.pixelformat):
             continue
         pace = kernel.StreamParameters(type=kernel.CAPTURE, numerator=1000, denominator=round(1000 * rate))
-        if kernel.answers(node, kernel.SET_PARAMETERS, pace) and pace.numerator:
-            if abs(pace.denominator / pace.numerator / rate - 1.0) > 0.01:
-                continue
-        hd = got.encoding == 2 or (got.encoding == 0 and got.colorspace == 3)  # V4L2_YCBCR_ENC_709, _COLORSPACE_REC709
+        paced = kernel.answers(node, kernel.SET_PARAMETERS, pace) and pace.numerator
+        if paced and abs(pace.denominator / pace.numerator / rate - 1.0) > 0.01:
+            continue
+        hd = got.encoding == 2 or (got.encoding == 0 and got.colorspace == 3)  # V4L2_YCBCR_ENC_709, or by default
         return PictureDecoder(name, width, height, "ITU709" if hd else "ITU601", full=got.quantization == 1)
     offered = "\n  ".join(kernel.list_modes(node)) or "no format that can be decoded"
     raise NotSupported(

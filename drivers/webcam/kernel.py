@@ -211,23 +211,27 @@ def fourcc(text: str) -> int:
     return int.from_bytes(text.encode(), "little")
 
 
-def list_modes(node: VideoNode) -> Iterator[str]:
-    """Yield the formats of a camera that can be decoded, each with its sizes and the highest rate of each."""
+def list_modes(node: VideoNode) -> list[str]:
+    """Return the sizes of a camera and the rates of each, by format; those alike together. Others are left out."""
     names = {fourcc(code): name for name, (code, *_) in FORMATS.items()}
-    known = FormatDescription(type=CAPTURE)
+    known, modes = FormatDescription(type=CAPTURE), dict[str, list[str]]()
     while answers(node, LIST_FORMATS, known):
-        name = names.get(known.pixelformat)
-        if name is not None:
-            size, texts = FrameSize(pixelformat=known.pixelformat), []
-            while answers(node, LIST_SIZES, size):
-                width, height, *more = size.size
-                if size.type != 1:  # V4L2_FRMSIZE_TYPE_DISCRETE
-                    texts.append(f"{width}x{more[1]} to {height}x{more[2]}")
-                    break
-                texts.append(f"{width}x{height}{_describe_rates(node, known.pixelformat, width, height)}")
-                size.index += 1
-            yield f"{name}: {', '.join(texts) or 'any size'}"
+        if known.pixelformat in names:
+            sizes = ", ".join(_list_sizes(node, known.pixelformat)) or "any size"
+            modes.setdefault(sizes, []).append(names[known.pixelformat])
         known.index += 1
+    return [f"{', '.join(formats)}: {sizes}" for sizes, formats in modes.items()]
+
+
+def _list_sizes(node: VideoNode, pixelformat: int) -> Iterator[str]:
+    record = FrameSize(pixelformat=pixelformat)
+    while answers(node, LIST_SIZES, record):
+        width, height, *more = record.size
+        if record.type != 1:  # V4L2_FRMSIZE_TYPE_DISCRETE
+            yield f"{width}x{more[1]} to {height}x{more[2]}"
+            return
+        yield f"{width}x{height}{_describe_rates(node, pixelformat, width, height)}"
+        record.index += 1
 
 
 def _describe_rates(node: VideoNode, pixelformat: int, width: int, height: int) -> str:

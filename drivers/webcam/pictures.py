@@ -25,7 +25,7 @@ class PictureDecoder:
         name: One of :data:`.settings.FORMATS`.
         width: Width of the frames, pixels.
         height: Height, pixels.
-        matrix: ``ITU601`` or ``ITU709``: how brightness and colour are mixed, for formats that do not say it themselves.
+        matrix: ``ITU601`` or ``ITU709``: how colours are encoded in formats that do not say it themselves.
         full: Whether their values use the full range of 0..255.
     """
 

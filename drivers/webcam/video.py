@@ -66,9 +66,7 @@ class VideoCamera(CameraDriver):
         settings, name = self._settings, self.spec.name
         options = {"rtsp_transport": settings.transport, "fflags": "nobuffer"} if settings.url else {}
         try:
-            container = av.open(
-                settings.file or settings.url, timeout=(_OPEN, settings.stall_s), options=options
-            )
+            container = av.open(settings.file or settings.url, timeout=(_OPEN, settings.stall_s), options=options)
         except FileNotFoundError as error:
             raise DeviceNotFound(f"camera {name}: there is no video {settings.file or settings.url}") from error
         except (av.FFmpegError, OSError) as error:
@@ -130,7 +128,9 @@ class VideoCamera(CameraDriver):
                         self._newest = t, t_device, number, picture
                         self._news.notify_all()
         except av.error.ExitError:
-            end = ConnectionLost(f"camera {self.spec.name} sent nothing for {self._settings.stall_s:g} s", code="stalled")
+            end = ConnectionLost(
+                f"camera {self.spec.name} sent nothing for {self._settings.stall_s:g} s", code="stalled"
+            )
         except (av.FFmpegError, OSError, ValueError) as error:
             end = ConnectionLost(f"camera {self.spec.name}: {error}", code="device_error")
         with self._news:

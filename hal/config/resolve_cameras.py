@@ -26,6 +26,10 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
     """Return the record of a camera; None, with the problems added, if there are any."""
     key = f"cameras.{name}"
     model, file = context.read_model(CameraModel, key, config, "sensors", "cameras")
+    if "streams" not in config.model_fields_set:
+        with suppress(Unknown):
+            default = {name: stream for name, stream in config.streams.items() if name in model.streams}
+            config = config.model_copy(update={"streams": default or config.streams})
     for check in (_check_attached, _check_place):
         with suppress(Unknown):
             check(context, key, config)
@@ -171,7 +175,9 @@ def resolve_streams(context: Context, key: str, config: CameraConfig, model: Cam
     known, color = config.intrinsics, captures.get("color")
     if known is not None and color is not None and (known.width, known.height) != (color.width, color.height):
         size = f"{known.width}x{known.height}, not of {color.width}x{color.height}, which is captured"
-        context.report(f"{key}.intrinsics", f"are those of {size}: calibrate that size, or capture the other", "conflict")
+        context.report(
+            f"{key}.intrinsics", f"are those of {size}: calibrate that size, or capture the other", "conflict"
+        )
     if len(context.problems.found) > before:
         return None
     sensors: dict[str, SensorSpec] = {

@@ -199,10 +199,6 @@ class TestWebcam(CameraContract):
     bench = bench_of(webcam)
 
 
-class TestWebcamWithMjpeg(CameraContract):
-    bench = bench_of(partial(webcam, "mjpeg"))
-
-
 class TestVideoFile(CameraContract, left_out=dict.fromkeys(("lose", "restore", "freeze"), "a file has no link")):
     bench = bench_of(video_file)
 

@@ -34,10 +34,10 @@ def _spec(rate_hz: float, **options: Any) -> CameraSpec:
 
 
 @contextmanager
-def webcam(mode: str = "yuyv") -> Iterator[CameraBench]:
+def webcam() -> Iterator[CameraBench]:
     """A webcam; at 90 Hz it has only MJPEG."""
     with tempfile.TemporaryDirectory() as root, webcams(Path(root)) as (camera,):
-        driver = V4l2Camera(_spec({"yuyv": 60.0, "mjpeg": 90.0}[mode], stall_s=0.3))
+        driver = V4l2Camera(_spec(90.0, stall_s=0.3))
         yield CameraBench(
             driver=driver,
             patience=2.0,
