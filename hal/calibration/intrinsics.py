@@ -21,7 +21,7 @@ _ALIKE = 0.05
 _WORST_RMS = 1.0
 """Largest error of a result, pixels."""
 _UNSURE = 0.005
-"""Standard deviation of the focal lengths, as a share, from which a result is doubtful;"""
+"""Standard deviation of focal length and principal point, as a share of the former, above which it is doubtful;"""
 _TILT = 0.12
 """spread of the board's tilts (sine of the angle) in the direction in which it is least, below which it is, because the
 focal length and the distance cannot be told apart;"""
@@ -52,9 +52,11 @@ class LensFit:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Reasons why the result should not be used."""
-        relative, found = self.std[:2].max() / self.K[0, 0], []
+        relative, found = self.std.max() / self.K[0, 0], []
         if relative > _UNSURE or self.tilt < _TILT:
-            found.append("the focal length is uncertain: tilt the board by 20 to 45 degrees, to all sides")
+            found.append(
+                "focal length and principal point are uncertain: tilt the board by 20 to 45 degrees, to all sides"
+            )
         if self.reach < _REACH:
             found.append("the distortion is uncertain: hold the board near the corners of the image, too")
         return tuple(found)

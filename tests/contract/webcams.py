@@ -21,12 +21,12 @@ from hal.testing import CameraBench, camera_spec
 
 pytest.importorskip("av", reason="needs PyAV: pip install 'robot-hal[record]'")
 
-from webcam_kit import webcams
+from webcam_kit import webcams, write_video
 
 from hal.drivers.webcam.capture import V4l2Camera
 from hal.drivers.webcam.video import VideoCamera
 
-__all__ = ["network_camera", "video_file", "webcam", "write_video"]
+__all__ = ["network_camera", "video_file", "webcam"]
 
 
 def _spec(rate_hz: float, **options: Any) -> CameraSpec:
@@ -46,20 +46,6 @@ def webcam() -> Iterator[CameraBench]:
             freeze=lambda: setattr(camera, "frozen", True),
         )
         driver.close()
-
-
-def write_video(path: Path, frames: int, size: tuple[int, int] = (64, 48), rate: int = 30) -> None:
-    """Write a video without loss, in which the brightness of frame k is 4 k."""
-    import av
-
-    with av.open(path, "w") as container:
-        stream = container.add_stream("ffv1", rate=rate)
-        stream.width, stream.height, stream.pix_fmt = *size, "bgr0"
-        for k in range(frames):
-            picture = np.full((size[1], size[0], 3), 4 * k % 256, np.uint8)
-            for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")):
-                container.mux(packet)
-        container.mux(stream.encode())
 
 
 @contextmanager

@@ -212,3 +212,15 @@ def webcams(root: Path, *cameras: dict[str, str]) -> Iterator[list[FakeWebcam]]:
 
     with patch.object(kernel, "CLASS", root / "class"), patch.object(capture, "VideoNode", open_node):
         yield made
+
+
+def write_video(path: Path, frames: int, size: tuple[int, int] = (64, 48), rate: int = 30) -> None:
+    """Write a video without loss, in which the brightness of frame k is 8 k."""
+    with av.open(path, "w") as container:
+        stream = container.add_stream("ffv1", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = *size, "bgr0"
+        for k in range(frames):
+            picture = np.full((size[1], size[0], 3), 8 * k % 256, np.uint8)
+            for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")):
+                container.mux(packet)
+        container.mux(stream.encode())

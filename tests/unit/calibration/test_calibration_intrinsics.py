@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("cv2", reason="needs OpenCV: pip install 'robot-hal[calibration]'")
 
-from calibration_kit import BOARD, SIZE, K, pixels_of, poses
+from calibration_kit import BOARD, SIZE, WEBCAM, K, hold, pixels_of
 
 from hal.calibration import CalibrationFailed, LensViews, NoView
 from hal.config.files import parse_yaml
@@ -18,16 +18,6 @@ from hal.config.rigfile import IntrinsicsConfig
 from hal.images import distort_points
 
 BLANK = np.zeros((SIZE[1], SIZE[0]), np.uint8)
-WEBCAM = (0.1, -0.2, 0.001, -0.0008, 0.0)
-
-
-def hold(count: int, tilt: float = 0.5, aside: float = 0.15) -> list[Any]:
-    """The board in the camera's frame, held as a person does: tilted by up to ``tilt`` rad, up to ``aside`` m aside."""
-    chance = np.random.default_rng(3)
-    seen = poses(count, seed=3, turns=(tilt, tilt, 0.5))
-    for pose in seen:
-        pose[:2, 3] += chance.uniform(-aside, aside, 2) * (1.0, 0.7)
-    return seen
 
 
 class Corners:
