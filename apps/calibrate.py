@@ -146,6 +146,7 @@ def _print_board(args: argparse.Namespace) -> int:
 
 def _measure_lens(args: argparse.Namespace) -> int:
     from hal import calibration, registry
+    from hal.calibration.setup import choose_spec
     from hal.camera import Camera
     from hal.clock import RealClock
     from hal.config import load
@@ -153,7 +154,7 @@ def _measure_lens(args: argparse.Namespace) -> int:
     if args.views < calibration.LEAST_PICTURES:
         raise CommandError(f"--views must be at least {calibration.LEAST_PICTURES}, not {args.views}")
     plan = load(**config_options(args)).resolve()
-    spec = calibration.choose_spec("camera", args.camera, {camera.name: camera for camera in plan.cameras})
+    spec = choose_spec("camera", args.camera, {camera.name: camera for camera in plan.cameras})
     if plan.engine == spec.driver:
         raise CommandError(
             f"camera {spec.name} is simulated, and its intrinsics are exact; add --real", code="simulated"

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from .intrinsics import LensViews as LensViews
     from .setup import CalibrationSetup as CalibrationSetup
     from .setup import RigFileOutput as RigFileOutput
-    from .setup import choose_spec as choose_spec
     from .setup import find_setup as find_setup
     from .setup import initial_guess as initial_guess
     from .solving import LEAST_VIEWS as LEAST_VIEWS
@@ -51,7 +50,7 @@ _MODULES = {
     "collecting": ("Collector", "ManualDrive", "add_view", "collect_views", "wait_for_enter"),
     "detection": ("BoardDetection", "Detector", "NoView"),
     "intrinsics": ("LEAST_PICTURES", "LensFit", "LensViews"),
-    "setup": ("CalibrationSetup", "RigFileOutput", "choose_spec", "find_setup", "initial_guess"),
+    "setup": ("CalibrationSetup", "RigFileOutput", "find_setup", "initial_guess"),
     "solving": ("LEAST_VIEWS", "Calibration", "CalibrationFailed", "Eye", "Uncertainty", "View", "solve"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
