@@ -1,8 +1,9 @@
-"""Calibrate a camera on the hand or beside the arm, with a printed board; or find where a gripper is closed.
+"""Calibrate a camera with a printed board, its pose or its intrinsics; or find where a gripper is closed.
 
 hal calibrate board --out board.pdf
 hal calibrate --sim --config panda_calibration --camera wrist --auto
 hal calibrate --real --config my_rig.yaml --camera wrist --auto
+hal calibrate intrinsics --real --config my_rig.yaml --camera scene
 hal calibrate gripper --real --config my_rig.yaml
 """
 
@@ -11,16 +12,26 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import hal
-from hal.apps._common import ACTION_NEEDED, add_rig_options, check_everything, config_options, rig_options, run_app
+from hal.apps._common import (
+    ACTION_NEEDED,
+    add_config_options,
+    add_rig_options,
+    check_everything,
+    config_options,
+    rig_options,
+    run_app,
+)
 from hal.apps._display import banner, list_devices, list_links
 from hal.apps._gripper_zero import find_zero, gripper_parser
 from hal.errors import CommandError
 
 if TYPE_CHECKING:
-    from hal.calibration import Board, Calibration, CalibrationSetup, Collector, RigFileOutput
+    from hal.calibration import Board, Calibration, Collector, LensViews, RigFileOutput
+    from hal.camera import Camera
     from hal.geometry import Pose
     from hal.rig import Rig
 
@@ -32,8 +43,8 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="hal calibrate",
         description="Calibrate a camera on the hand or beside the arm, with a printed board.",
-        epilog="To print the board: hal calibrate board --out board.pdf. To find where a gripper is closed: "
-        "hal calibrate gripper. Ctrl-C stops the arm.",
+        epilog="To print the board: hal calibrate board --out board.pdf. Focal length and distortion of a "
+        "webcam: hal calibrate intrinsics. Where a gripper is closed: hal calibrate gripper. Ctrl-C stops the arm.",
     )
     add_rig_options(made)
     task = made.add_argument_group("task")
@@ -60,11 +71,16 @@ def parser() -> argparse.ArgumentParser:
         help="with --auto: approximate pose of the camera (default: from the rig file)",
     )
     views.add_argument("--mapping", metavar="FILE", help="gamepad mapping (default: the pad's own)")
+    add_result_options(made)
+    return made
+
+
+def add_result_options(made: argparse.ArgumentParser) -> None:
+    """Add the options of what is done with the result."""
     result = made.add_argument_group("result")
     result.add_argument("--compare", action="store_true", help="show the difference from the rig file; write nothing")
     result.add_argument("--out", metavar="FILE", help="write a copy of the rig file instead of changing it")
     result.add_argument("--yes", action="store_true", help="write without confirmation, unless the result is doubtful")
-    return made
 
 
 def add_board_options(group: argparse._ActionsContainer) -> None:
@@ -81,11 +97,31 @@ def board_parser() -> argparse.ArgumentParser:
     return made
 
 
+def intrinsics_parser() -> argparse.ArgumentParser:
+    """Return the parser of ``calibrate intrinsics``."""
+    made = argparse.ArgumentParser(
+        prog="hal calibrate intrinsics",
+        description="Measure focal length, principal point and lens distortion of a camera that does not report its "
+        "own. Hold the board in front of it, tilted to all sides, near the corners of the image, near and far: a view "
+        "is taken whenever it differs. No arm moves.",
+        epilog="Ctrl-C ends, with the views taken so far.",
+    )
+    add_config_options(made)
+    task = made.add_argument_group("task")
+    task.add_argument("--camera", metavar="NAME", help="camera (default: the rig's only one)")
+    task.add_argument("--views", type=int, default=VIEWS, metavar="N", help="how many (%(default)s)")
+    add_board_options(task)
+    add_result_options(made)
+    return made
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the program; return its exit status."""
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["board"]:
         return run_app(_print_board, board_parser(), given[1:])
+    if given[:1] == ["intrinsics"]:
+        return run_app(_measure_lens, intrinsics_parser(), given[1:])
     if given[:1] == ["gripper"]:
         return run_app(find_zero, gripper_parser(), given[1:])
     return run_app(_main, parser(), given)
@@ -106,6 +142,61 @@ def _print_board(args: argparse.Namespace) -> int:
     print(f"{args.out}: {board}, on {1e3 * width:.0f} x {1e3 * height:.0f} mm. Print at 100 %, glue onto a flat plate,")
     print("and measure a square with a calliper; if it differs, add --square when calibrating.")
     return 0
+
+
+def _measure_lens(args: argparse.Namespace) -> int:
+    from hal import calibration, registry
+    from hal.calibration.setup import choose_spec
+    from hal.camera import Camera
+    from hal.clock import RealClock
+    from hal.config import load
+
+    if args.views < calibration.LEAST_PICTURES:
+        raise CommandError(f"--views must be at least {calibration.LEAST_PICTURES}, not {args.views}")
+    plan = load(**config_options(args)).resolve()
+    spec = choose_spec("camera", args.camera, {camera.name: camera for camera in plan.cameras})
+    if plan.engine == spec.driver:
+        raise CommandError(
+            f"camera {spec.name} is simulated, and its intrinsics are exact; add --real", code="simulated"
+        )
+    output = None if args.compare else calibration.RigFileOutput.of(plan.source, args.out, spec.name)
+    if output is not None:
+        size = f"width: {spec.capture_width}, height: {spec.capture_height}"
+        output.check("intrinsics", f"{{{size}, fx: 1, fy: 1, cx: 0, cy: 0}}")
+    views = calibration.LensViews(calibration.Detector(_board(args)))
+    raw = replace(
+        spec, width=spec.capture_width, height=spec.capture_height, options={**spec.options, "undistort": False}
+    )
+    camera = Camera(registry.load(spec.driver, "camera")(raw, RealClock()), RealClock(), threaded=True)
+    try:
+        camera.open()
+        _take_pictures(camera, views, args.views)
+    except (hal.ConnectionLost, hal.StaleStateError, KeyboardInterrupt) as end:
+        print(f"ended: {str(end) or 'Ctrl-C'}. Continuing with {len(views)} views", flush=True)
+    finally:
+        camera.close()
+    found = views.solve()
+    (fx, _, cx), (_, fy, cy), _ = found.K
+    numbers = [f"{value:.1f} +- {std:.1f}" for value, std in zip((fx, fy, cx, cy), found.std, strict=True)]
+    print(f"\nfx, fy, cx, cy: {', '.join(numbers)} px; corners off by {found.error_px:.2f} px ({found.views} views)")
+    print("\n".join(f"WARNING: {text}" for text in found.doubts))
+    return _write(args, output, plan.source, spec.name, ("intrinsics", found.entry()), found.doubts)
+
+
+def _take_pictures(camera: Camera, views: LensViews, wanted: int) -> None:
+    """Take frames until enough of them show the board differently."""
+    from hal.calibration import NoView
+
+    last = ""
+    while len(views) < wanted:
+        try:
+            corners = views.add(camera.read(timeout=5.0).color)
+            text = f"view {len(views)} of {wanted}: {corners} corners"
+        except NoView as reason:
+            text = str(reason)
+        if text != last:
+            print(f"  {text}", flush=True)
+            last = text
 
 
 def _main(args: argparse.Namespace) -> int:
@@ -143,10 +234,7 @@ def _main(args: argparse.Namespace) -> int:
             print(f"ended: {str(end) or 'Ctrl-C'}. Continuing with {len(collector.views)} views", flush=True)
     found = calibration.solve(collector.views, setup.eye)
     print("\n".join(["", *report_lines(found), "", *difference_lines(setup.known, found.camera, setup.frame)]))
-    if output is None:
-        print("" if args.compare else f"not written: {plan.source} is built in; --out my_rig.yaml writes a copy")
-        return 0
-    return _write(args, output, setup, found)
+    return _write(args, output, plan.source, setup.camera, setup.entry(found.camera), found.doubts)
 
 
 def _collect(args: argparse.Namespace, rig: Rig, collector: Collector, guess: Pose | None) -> None:
@@ -211,21 +299,30 @@ def difference_lines(old: Pose | None, new: Pose, frame: str) -> list[str]:
     return lines
 
 
-def _write(args: argparse.Namespace, output: RigFileOutput, setup: CalibrationSetup, found: Calibration) -> int:
+def _write(
+    args: argparse.Namespace,
+    output: RigFileOutput | None,
+    source: str,
+    camera: str,
+    entry: tuple[str, str],
+    doubts: tuple[str, ...],
+) -> int:
     """Write the result to the rig's file after confirmation; raise CalibrationFailed for a doubtful one with --yes."""
     from hal.calibration import CalibrationFailed
 
-    key, value = setup.entry(found.camera)
-    print(f"\ncameras.{setup.camera} of {output.path}:\n  {key}: {value}", flush=True)
-    if args.yes and found.doubts:
+    key, value = entry
+    if output is None:
+        print("" if args.compare else f"not written: {source} is built in; --out my_rig.yaml writes a copy")
+        return 0
+    print(f"\ncameras.{camera} of {output.path}:\n  {key}: {value}", flush=True)
+    if args.yes and doubts:
         raise CalibrationFailed(
-            f"not written: a doubtful result is not written with --yes, run without it to confirm: "
-            f"{'; '.join(found.doubts)}",
+            f"not written: a doubtful result is not written with --yes, run without it to confirm: {'; '.join(doubts)}",
             code="not_confirmed",
         )
     if not args.yes:
         try:
-            answer = input("Write it despite the warning? [y/N] " if found.doubts else "Write it? [y/N] ")
+            answer = input("Write it despite the warning? [y/N] " if doubts else "Write it? [y/N] ")
         except EOFError:
             answer = ""
         if not answer.strip().lower().startswith("y"):

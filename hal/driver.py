@@ -394,7 +394,8 @@ class CameraInfo:
     """Camera matrix (3, 3) of both infrared images of a frame, which are never aligned; None without infrared."""
     clock: str
     """Clock of ``Stamp.t_device``: ``hardware`` (the sensor's own), ``global`` (the sensor's, converted by its library
-    to the host's time of day), ``system`` (the host's time of day at arrival) or ``simulated``."""
+    to the host's time of day), ``system`` (the host's at arrival), ``kernel`` (the host's monotonic one, stamped by its
+    kernel), ``video`` (the time in a video) or ``simulated``."""
     serial: str | None = None
     firmware: str | None = None
     usb: str | None = None

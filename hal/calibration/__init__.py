@@ -1,4 +1,4 @@
-"""Hand-eye calibration: the pose of a camera on the hand or beside the arm, from images of a printed board.
+"""Calibration of a camera by a printed board: its pose on the hand or beside the arm, and its intrinsics.
 
 Everything that a program needs is here; the modules behind it are loaded when they are first used, so importing this
 package needs neither OpenCV nor SciPy::
@@ -10,6 +10,7 @@ package needs neither OpenCV nor SciPy::
 
 ``board`` is the printed board, ``detection`` finds it in an image, ``collecting`` moves the arm and takes the views,
 ``solving`` computes the pose from them, and ``setup`` reads the rig's file and writes the result into it.
+``intrinsics`` is another problem with the same board: focal length and lens distortion.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from .detection import BoardDetection as BoardDetection
     from .detection import Detector as Detector
     from .detection import NoView as NoView
+    from .intrinsics import LEAST_PICTURES as LEAST_PICTURES
+    from .intrinsics import LensFit as LensFit
+    from .intrinsics import LensViews as LensViews
     from .setup import CalibrationSetup as CalibrationSetup
     from .setup import RigFileOutput as RigFileOutput
     from .setup import find_setup as find_setup
@@ -45,6 +49,7 @@ _MODULES = {
     "board": ("Board", "load_board", "print_board"),
     "collecting": ("Collector", "ManualDrive", "add_view", "collect_views", "wait_for_enter"),
     "detection": ("BoardDetection", "Detector", "NoView"),
+    "intrinsics": ("LEAST_PICTURES", "LensFit", "LensViews"),
     "setup": ("CalibrationSetup", "RigFileOutput", "find_setup", "initial_guess"),
     "solving": ("LEAST_VIEWS", "Calibration", "CalibrationFailed", "Eye", "Uncertainty", "View", "solve"),
 }

@@ -126,13 +126,14 @@ class Detector:
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._detector = aruco.CharucoDetector(board.make_opencv(), aruco.CharucoParameters(), parameters)
 
-    def find(self, picture: NDArray[np.uint8], K: ArrayLike, distortion: ArrayLike) -> BoardDetection:
-        """Detect the board.
+    def find_corners(self, picture: NDArray[np.uint8]) -> tuple[Array, Array, float]:
+        """Detect the board's corners, whatever the camera's intrinsics are.
 
         Args:
             picture: (H, W, 3) RGB, or (H, W).
-            K: (3, 3) of the camera.
-            distortion: (5,) of the camera.
+
+        Returns:
+            The corners (n, 3) in the board's frame, m; their pixels (n, 2); and the width of the edges, pixels.
 
         Raises:
             NoView: The board is not in the image, or not visible well enough.
@@ -152,6 +153,20 @@ class Detector:
         blur = edge_width(grey, pixels, side)
         if blur > max(3.0, BLURRED * side):
             raise NoView(f"the image is blurred: edges are {blur:.1f} pixels wide, a square {side:.0f}", code="blurred")
+        return points, pixels, blur
+
+    def find(self, picture: NDArray[np.uint8], K: ArrayLike, distortion: ArrayLike) -> BoardDetection:
+        """Detect the board.
+
+        Args:
+            picture: (H, W, 3) RGB, or (H, W).
+            K: (3, 3) of the camera.
+            distortion: (5,) of the camera.
+
+        Raises:
+            NoView: The board is not in the image, or not visible well enough.
+        """
+        points, pixels, blur = self.find_corners(picture)
         camera = np.asarray(K, float)
         try:
             pixels = undistort_pixels(pixels, camera, distortion)

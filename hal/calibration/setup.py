@@ -30,6 +30,7 @@ __all__ = [
     "CalibrationSetup",
     "RigFileOutput",
     "back_up",
+    "choose_spec",
     "find_setup",
     "initial_guess",
     "replace_camera_place",
@@ -91,11 +92,11 @@ def find_setup(
     Raises:
         CommandError: A name is missing or unknown; lists the available ones.
     """
-    spec = _choose("camera", camera, {camera.name: camera for camera in plan.cameras})
+    spec = choose_spec("camera", camera, {camera.name: camera for camera in plan.cameras})
     attached = rig.cameras[spec.name].attached
     if robot is None and attached is not None:
         robot = attached.robot
-    arm = _choose("robot", robot, {robot.name: robot for robot in plan.robots})
+    arm = choose_spec("robot", robot, {robot.name: robot for robot in plan.robots})
     if eye is None:
         if spec.view is None:
             raise CommandError(
@@ -142,7 +143,8 @@ def initial_guess(setup: CalibrationSetup, text: str | None) -> Pose:
     return setup.known
 
 
-def _choose(kind: str, name: str | None, specs: Mapping[str, Spec]) -> Spec:
+def choose_spec(kind: str, name: str | None, specs: Mapping[str, Spec]) -> Spec:
+    """Return the record with that name, or the only one. Raises CommandError, which lists the available ones."""
     if name is None:
         if len(specs) == 1:
             return next(iter(specs.values()))
@@ -166,7 +168,7 @@ def _check_link(arm: RobotSpec, link: str) -> None:
 
 
 class RigFileOutput:
-    """The rig's file that the camera's new place is written to. It is checked before the arm moves.
+    """The rig's file that a result is written to. It is checked before the arm moves.
 
     Args:
         source: The rig's file.
@@ -198,6 +200,17 @@ class RigFileOutput:
     def _replace_place(self, key: str, value: str) -> str:
         return replace_camera_place(self.source.read_bytes().decode("utf-8"), self.camera, key, value)
 
+    def check(self, key: str, value: str) -> str:
+        """Return the file's text with the entry; raises as :meth:`write`."""
+        text = self._replace_place(key, value)
+        trial = self.path.resolve().with_name(f".{self.path.name}.trial.yaml")
+        try:
+            write_file(trial, text)
+            load(trial)
+        finally:
+            trial.unlink(missing_ok=True)
+        return text
+
     def write(self, key: str, value: str) -> list[str]:
         """Write the entry and keep a copy of the previous file; return messages for the terminal.
 
@@ -208,13 +221,7 @@ class RigFileOutput:
             ConfigError: The new file would not be a valid rig; nothing is changed.
             OSError: The file cannot be written; nothing is changed.
         """
-        text = self._replace_place(key, value)
-        trial = self.path.resolve().with_name(f".{self.path.name}.trial.yaml")
-        try:
-            write_file(trial, text)
-            load(trial)
-        finally:
-            trial.unlink(missing_ok=True)
+        text = self.check(key, value)
         messages = []
         if self.path.exists():
             messages.append(f"previous version: {back_up(self.path)}")
@@ -223,7 +230,7 @@ class RigFileOutput:
 
 
 def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
-    """Replace a camera's place in the text of a rig's file; every other character stays as it is.
+    """Replace a camera's place, or another key, in the text of a rig's file; every other character stays as it is.
 
     Libraries that edit YAML (ruamel.yaml) rewrite indentation, quotes, line ends and aligned comments elsewhere in a
     file, so the entry is located with PyYAML and replaced in the text.
@@ -231,7 +238,7 @@ def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
     Args:
         text: Text of the file.
         camera: Name of the camera.
-        key: ``pose`` or ``attached``; replaces whichever of :data:`PLACES` is there.
+        key: ``pose`` or ``attached``, which replaces whichever of :data:`PLACES` is there; or another key.
         value: Its value as YAML, in one line.
 
     Returns:
@@ -241,10 +248,10 @@ def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
         CommandError: The place cannot be changed alone (anchors, merged or repeated keys); the message has the entry to
             write by hand.
     """
-    entry = f"{key}: {value}"
-    by_hand = f"edit cameras.{camera} by hand: replace {', '.join(PLACES)} with\n  {entry}"
+    entry, old = f"{key}: {value}", PLACES if key in PLACES else (key,)
+    by_hand = f"edit cameras.{camera} by hand: replace {', '.join(old)} with\n  {entry}"
     try:
-        changed = _edit_text(text, camera, entry)
+        changed = _edit_text(text, camera, entry, old)
         fits = parse_yaml(changed) == _change_data(parse_yaml(text), camera, key, value)
     except (yaml.YAMLError, LookupError, TypeError) as error:
         raise CommandError(f"the file cannot be edited ({error}); {by_hand}", code="not_editable") from None
@@ -257,22 +264,26 @@ def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
 
 def _change_data(data: Any, camera: str, key: str, value: str) -> Any:
     """The file's data after the change."""
-    entries = {name: item for name, item in data["cameras"][camera].items() if name not in PLACES}
+    old = PLACES if key in PLACES else (key,)
+    entries = {name: item for name, item in data["cameras"][camera].items() if name not in old}
     entries[key] = parse_yaml(value)
     return {**data, "cameras": {**data["cameras"], camera: entries}}
 
 
-def _edit_text(text: str, camera: str, entry: str) -> str:
-    """The new text. Raises LookupError and TypeError if the file has another structure than expected."""
+def _edit_text(text: str, camera: str, entry: str, old: tuple[str, ...]) -> str:
+    """The new text, with the entry in the place of one of the keys ``old``.
+
+    Raises LookupError and TypeError if the file has another structure than expected.
+    """
     root = yaml.compose(text, Loader=yaml.SafeLoader)  # in Python, since libyaml's counts bytes
     settings = _value(_value(root, "cameras"), camera)
     if not isinstance(settings, yaml.MappingNode) or not settings.value:
         raise LookupError(f"cameras.{camera} has no keys")
-    places = [name.value for name, _ in settings.value if name.value in PLACES]
+    places = [name.value for name, _ in settings.value if name.value in old]
     if len(places) > 1:
         raise LookupError(f"cameras.{camera} has {len(places)} places: {', '.join(places)}")
     for name, value in settings.value:
-        if name.value in PLACES:
+        if name.value in old:
             start, end = name.start_mark.index, _end(value)
             if not start < end:
                 raise LookupError(f"the value of cameras.{camera}.{name.value} is elsewhere")

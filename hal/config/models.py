@@ -326,6 +326,9 @@ def _make_streams() -> dict[SensorStream, StreamModel]:
     return {"color": StreamModel(), "depth": StreamModel(), "infrared": StreamModel()}
 
 
+Distortion = Annotated[tuple[float, ...], Several(Quantity("", -1e3, 1e3), 5, "k1, k2, p1, p2, k3")]
+
+
 class CameraModel(Strict):
     """A camera."""
 
@@ -337,13 +340,7 @@ class CameraModel(Strict):
     """Default size and rate."""
     field_of_view: FieldOfView | None = None
     """Angles of every stream that has none of its own."""
-    distortion: Annotated[tuple[float, ...], Several(Quantity("", -1e3, 1e3), 5, "k1, k2, p1, p2, k3")] = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth: Depth
     streams: Annotated[dict[SensorStream, StreamModel], BeforeValidator(expand_names)] = Field(

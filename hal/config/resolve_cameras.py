@@ -26,6 +26,10 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
     """Return the record of a camera; None, with the problems added, if there are any."""
     key = f"cameras.{name}"
     model, file = context.read_model(CameraModel, key, config, "sensors", "cameras")
+    if "streams" not in config.model_fields_set:
+        with suppress(Unknown):
+            default = {name: stream for name, stream in config.streams.items() if name in model.streams}
+            config = config.model_copy(update={"streams": default or config.streams})
     for check in (_check_attached, _check_place):
         with suppress(Unknown):
             check(context, key, config)
@@ -65,7 +69,7 @@ def _make_spec(
         height=output.height,
         rate_hz=min((sensor.rate_hz for sensor in streams.sensors.values()), default=reference.rate_hz),
         K=_crop_matrix(reference, output),
-        distortion=(0.0,) * 5 if simulated else model.distortion,  # rendered images have none
+        distortion=_find_distortion(config, model, simulated),
         depth_min=streams.depth_min,
         depth_max=(config.depth or model.depth).max,
         streams=tuple(config.streams),
@@ -76,6 +80,12 @@ def _make_spec(
         depth_sensor=DepthSensorSpec(sensor.kind, sensor.unit, model.baseline) if sensor is not None else None,
         K_infrared=None if all(_share_view(one, reference) for one in infrared) else _crop_matrix(infrared[0], output),
     )
+
+
+def _find_distortion(config: CameraConfig, model: CameraModel, simulated: bool) -> tuple[float, ...]:
+    if simulated:
+        return (0.0,) * 5  # rendered images have none
+    return model.distortion if config.intrinsics is None else config.intrinsics.distortion
 
 
 def _share_view(one: SensorSpec, other: SensorSpec) -> bool:
@@ -101,7 +111,7 @@ def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
 
 
 def _check_adjustable(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
-    for part in ("field_of_view", "depth"):
+    for part in ("field_of_view", "depth", "intrinsics"):
         if not model.adjustable and getattr(config, part, None) is not None:
             text = f"is fixed by model {config.model!r}; only adjustable models leave it to the rig"
             context.report(f"{key}.{part}", text, "not_adjustable")
@@ -162,6 +172,12 @@ def resolve_streams(context: Context, key: str, config: CameraConfig, model: Cam
     if config.align not in (None, *on):
         message = f"is {align}, which is not one of the enabled streams: {', '.join(on)}"
         context.report(f"{key}.align", message, "conflict")
+    known, color = config.intrinsics, captures.get("color")
+    if known is not None and color is not None and (known.width, known.height) != (color.width, color.height):
+        size = f"{known.width}x{known.height}, not of {color.width}x{color.height}, which is captured"
+        context.report(
+            f"{key}.intrinsics", f"are those of {size}: calibrate that size, or capture the other", "conflict"
+        )
     if len(context.problems.found) > before:
         return None
     sensors: dict[str, SensorSpec] = {
@@ -245,6 +261,9 @@ def _make_sensor(config: CameraConfig, model: CameraModel, name: Stream, capture
 
 
 def _intrinsics(config: CameraConfig, model: CameraModel, name: str, capture: Capture) -> Intrinsics:
+    known = config.intrinsics if model.adjustable and name == "color" else None
+    if known is not None:
+        return Intrinsics(known.fx, known.fy, known.cx, known.cy)
     angles = (config.field_of_view if model.adjustable else None) or model.stream(name).field_of_view
     sensor = (angles.width, angles.height) if angles.width is not None and angles.height is not None else None
     return from_field_of_view(capture.width, capture.height, angles.horizontal_deg, angles.vertical_deg, sensor)

@@ -26,7 +26,7 @@ from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_
 from ..registry import explain_engine
 from ..specs import ViewSpec
 from ..types import STREAMS
-from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, expand_names
+from .models import Capture, Depth, Distortion, Drivers, FieldOfView, LimitsModel, expand_names
 from .randomize import RandomizeConfig
 from .schema import (
     CameraRate,
@@ -281,6 +281,23 @@ def _make_default_streams() -> dict[Stream, StreamConfig]:
     return {"color": StreamConfig(), "depth": StreamConfig()}
 
 
+_Place = Annotated[float, Quantity("pixels", -1e5, 1e5)]
+_FocalLength = Annotated[float, Quantity("pixels", 1.0, 1e5)]
+
+
+class IntrinsicsConfig(Strict):
+    """Intrinsics of a camera for one size of the captured images, pixels."""
+
+    width: Pixels
+    height: Pixels
+    fx: _FocalLength
+    fy: _FocalLength
+    cx: _Place
+    cy: _Place
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 (OpenCV's order)."""
+
+
 class CameraConfig(Device):
     """A camera. One of ``look_at``, ``pose`` and ``attached`` gives its pose."""
 
@@ -305,6 +322,8 @@ class CameraConfig(Device):
     """Only for models that leave it to the rig (``pinhole``)."""
     depth: Depth | None = None
     """Nearest and farthest depth, m; only for models that leave it to the rig."""
+    intrinsics: IntrinsicsConfig | None = None
+    """Of the colour images, as ``hal calibrate intrinsics`` writes them; only for models that leave them to the rig."""
 
     @model_validator(mode="after")
     def _check_place(self) -> CameraConfig:

@@ -29,7 +29,7 @@ _READ = 15.0
 """s within which ``read`` must return a frame, on a busy machine."""
 _APP_WAIT = 0.3
 """s; a time-out of ``read`` that the checks try."""
-_CLOCKS = ("hardware", "global", "system", "simulated")
+_CLOCKS = ("hardware", "global", "system", "kernel", "video", "simulated")
 
 
 def _images(frame: RawFrame) -> dict[str, np.ndarray]:

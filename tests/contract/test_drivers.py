@@ -44,6 +44,7 @@ from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
 from .pads import mock_pad, playback_pad, terminal_steps, web_pad
+from .webcams import network_camera, video_file, webcam
 
 NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simulation: there is no link")
 
@@ -190,6 +191,20 @@ class TestSimulatedCameraInRealTime(
             worlds.append(RenderedWorld())
         with worlds[-1].camera() as bench:
             yield bench
+
+
+class TestWebcam(CameraContract):
+    """In memory; tests/kernel has the same contract on the kernel's own test camera."""
+
+    bench = bench_of(webcam)
+
+
+class TestVideoFile(CameraContract, left_out=dict.fromkeys(("lose", "restore", "freeze"), "a file has no link")):
+    bench = bench_of(video_file)
+
+
+class TestNetworkCamera(CameraContract):
+    bench = bench_of(network_camera)
 
 
 @pytest.mark.slow

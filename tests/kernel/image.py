@@ -21,7 +21,10 @@ _MODULES = (
     *("evdev", "uinput", "uhid", "hid-generic", "hid-sony", "hid-playstation"),
     *("vhci-hcd", "xpad"),
     *("vcan", "can-raw"),
+    "vivid",
 )
+_OPTIONS = {"vivid": "n_devs=2 node_types=0x1,0x1 num_inputs=1,1 input_types=0,0"}
+"""Options with which a module is loaded: two cameras."""
 TEXT, PROGRAM = 0o100644, 0o100755  # modes of files
 
 
@@ -32,7 +35,8 @@ class Image(NamedTuple):
     """The kernel's package."""
     kernel: Path
     initrd: Path
-    """An archive of ``busybox``, the modules, and ``modules``: their names in the order in which they load."""
+    """An archive of ``busybox``, the modules, and ``modules``: a line for each, in the order in which they load, with
+    its name and its options."""
 
 
 def image_for(series: str, refresh: bool, say: Callable[[str], None]) -> Image:
@@ -40,7 +44,7 @@ def image_for(series: str, refresh: bool, say: Callable[[str], None]) -> Image:
 
     With ``refresh`` the newest package is downloaded though there is an image in the cache. Raises Missing.
     """
-    recipe = hashlib.sha256(" ".join(_MODULES).encode()).hexdigest()[:8]
+    recipe = hashlib.sha256(f"{_MODULES} {_OPTIONS}".encode()).hexdigest()[:8]
     known = list(_cache().glob(f"linux-image-{series}.*"))
     for folder in known:
         if folder.name.endswith(f".{recipe}") and not refresh:
@@ -70,7 +74,7 @@ def _make(name: str, scratch: Path) -> Path:
     modules = _with_what_they_need(_MODULES, package)
     files = [
         ("busybox", PROGRAM, busybox.read(busybox.find(r"(usr/)?bin/busybox"))),
-        ("modules", TEXT, "".join(f"{module}\n" for module in modules).encode()),
+        ("modules", TEXT, "".join(f"{module} {_OPTIONS.get(module, '')}\n" for module in modules).encode()),
         *((f"{module}.ko", TEXT, data) for module, data in modules.items()),
     ]
     made = scratch / "image"

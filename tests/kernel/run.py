@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import signal
 import sys
@@ -93,7 +94,7 @@ def _job(expression: str) -> str:
         "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
         "HOME": "/run",
         "TMPDIR": "/run",
-        "PYTHONPATH": str(guest),
+        "PYTHONPATH": os.pathsep.join([str(guest), os.environ.get("PYTHONPATH", "")]),
         "PYTHONDONTWRITEBYTECODE": "1",
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         "HAL_KERNEL_PAD": json.dumps(_pad()),

@@ -37,6 +37,7 @@ Z = motion(np.array([0.5, 0.1, 0.02, 3.0, 0.1, 0.3]))
 """Pose of the board: in the world, or in the link's frame."""
 CAMERA = Pose.from_matrix(X)
 LENS = (0.12, -0.25, 0.001, -0.0008, 0.05)
+WEBCAM = (0.1, -0.2, 0.001, -0.0008, 0.0)
 
 Array = NDArray[np.float64]
 
@@ -50,6 +51,15 @@ def poses(count: int, seed: int = 0, turns: tuple[float, float, float] = (0.5, 0
         pose[:3, 3] = middle - pose[:3, :3] @ BOARD.centre
         found.append(pose)
     return found
+
+
+def hold(count: int, tilt: float = 0.5, aside: float = 0.15) -> list[Array]:
+    """The board in the camera's frame, held as a person does: tilted by up to ``tilt`` rad, up to ``aside`` m aside."""
+    chance = np.random.default_rng(3)
+    seen = poses(count, seed=3, turns=(tilt, tilt, 0.5))
+    for pose in seen:
+        pose[:2, 3] += chance.uniform(-aside, aside, 2) * (1.0, 0.7)
+    return seen
 
 
 def pixels_of(pose: Array, lens: tuple[float, ...] = (0.0,) * 5, board: Board = BOARD) -> Array:

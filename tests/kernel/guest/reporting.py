@@ -14,7 +14,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     """One line for each check, and for a set-up or a clean-up that failed."""
     if report.when != "call" and not report.failed:
         return
-    name, _, what = report.nodeid.rpartition("::")[2].removeprefix("check_").partition("[")
+    name, _, what = report.nodeid.rpartition("::")[2].removeprefix("check_").removeprefix("test_").partition("[")
     where = "" if report.when == "call" else f" ({report.when})"
     measured = (str(value) for key, value in report.user_properties if key == "measured")
     _tell(
@@ -29,7 +29,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 def pytest_collectreport(report: pytest.CollectReport) -> None:
     """A file of checks that cannot be read."""
     if report.failed:
-        _tell(check=report.nodeid, passed=False, measured="", why=report.longreprtext)
+        _tell(check=report.nodeid, passed=False, seconds=0.0, measured="", why=report.longreprtext)
 
 
 def pytest_sessionfinish(exitstatus: int) -> None:
