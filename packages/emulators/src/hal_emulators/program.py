@@ -10,8 +10,6 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 
-__all__ = ["main", "parser"]
-
 DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand"}
 
 

@@ -36,8 +36,6 @@ from hal_emulators.shared_world import ArmInWorld
 
 from .plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
 
-__all__ = ["EmulatedDamiaoArm", "DamiaoMotor", "shorted_damping"]
-
 Send = Callable[[int, bytes, int], None]
 """Sends a frame: id, data, and the number of the motor that it comes from."""
 

@@ -48,8 +48,6 @@ from hal_emulators.shared_world import ArmInWorld
 
 from .plant import OFF, ArmPlant, Drive, JointMechanics
 
-__all__ = ["EmulatedPiperArm"]
-
 Send = Callable[[int, bytes, int], None]
 """Sends a frame: id, data, and the number of the motor that it comes from (0 for the controller)."""
 
