@@ -24,7 +24,7 @@ pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot
 for library in ("pyarrow", "av", "zstandard"):
     pytest.importorskip(library, reason="pip install 'robot-hal[record]'")
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
 
 tries = load_benchmark("emulated_skills")
 OPTIONS: dict[str, Any] = {"approach": 0.06, "lift": 0.06, "speed": 0.5, "unattended": True}
@@ -144,7 +144,6 @@ def test_a_hand_misses_and_loses_what_is_not_there(fr3: Bench) -> None:
         miss_and_lose(rig)
 
 
-@pytest.mark.alone
 def test_fingers_on_a_bus_hold_miss_and_lose(can: Bench) -> None:
     with can.open() as rig:
         arm = rig.robots["arm"]
@@ -158,7 +157,6 @@ def test_fingers_on_a_bus_hold_miss_and_lose(can: Bench) -> None:
         miss_and_lose(rig)
 
 
-@pytest.mark.alone
 def test_a_world_that_is_gone_shows_no_new_pictures() -> None:
     sets = ["objects=[floor]", f"cameras={tries.flow({'scene': tries.CAMERA})}"]
     rig_name = "yam_emulator"
