@@ -27,7 +27,7 @@ for library in ("pyarrow", "av", "zstandard"):
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
 
 tries = load_benchmark("emulated_skills")
-OPTIONS: dict[str, Any] = {"approach": 0.06, "lift": 0.06, "speed": 0.5, "unattended": True}
+OPTIONS: dict[str, Any] = {"approach": 0.06, "lift": 0.06, "speed": 0.3, "unattended": True}
 AREA = tries.BENCHES["YAM"]
 """What every arm here reaches."""
 
@@ -79,7 +79,7 @@ def height_of_cube(frame: hal.Frame) -> float:
 def prepare(rig: hal.Rig, x: float = -0.08, y: float = 0.03) -> hal.Pose:
     """Bring the arm home, open its fingers and put the cube before it; return how to grasp it."""
     arm = rig.robots["arm"]
-    arm.move_to(arm.home, speed=0.5, unattended=True)
+    arm.move_to(arm.home, speed=0.3, unattended=True)
     assert arm.gripper is not None
     arm.gripper.open()
     rig.world.reset("cube", pose=hal.Pose([x, y, AREA.cube["position"][2]]))
@@ -104,10 +104,10 @@ def test_an_episode_of_pick_and_place_is_recorded_and_replayed(fr3: Bench, tmp_p
             assert high - low == pytest.approx(OPTIONS["lift"], abs=0.01), "the camera sees it lifted"
             for shift in ([0.0, -0.08, 0.0], [0.0, -0.08, -OPTIONS["lift"]]):
                 there = hal.Pose(done.tcp.position + shift, done.tcp.orientation)
-                arm.move_to(there, straight=True, speed=0.5, unattended=True)
+                arm.move_to(there, straight=True, speed=0.3, unattended=True)
             arm.gripper.open()
             rig.clock.sleep(0.5)  # rows of the replay are not waited for: the fingers are open before the arm leaves
-            arm.move_to(arm.home, speed=0.5, unattended=True)
+            arm.move_to(arm.home, speed=0.3, unattended=True)
             recorder.save(success=True, wait=True)
         put = rig.world.pose("cube").position
         assert put == pytest.approx([-0.08, -0.05, AREA.cube["position"][2]], abs=5e-3)
