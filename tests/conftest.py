@@ -125,7 +125,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     To collect the 5,600 tests of the fast tier takes each worker 16 s.
     """
     if config.option.markexpr.startswith(WITHOUT_FAST) and _tier(collection_path) in FAST:
-        return True if collection_path.suffix == ".py" and "slow" not in collection_path.read_text("utf-8") else None
+        text = collection_path.read_text(encoding="utf-8") if collection_path.suffix == ".py" else "slow"
+        return None if "slow" in text or "alone" in text else True
     if config.option.markexpr not in ("", "fast") or _tier(collection_path) not in OTHERS:
         return None
     return None if _touches(collection_path, _named(config)) else True
