@@ -53,7 +53,7 @@ def _make_world(entry: dict[str, Any], engine: Engine) -> Any:
     return registry.load(engine.name, "world")(plan.world)
 
 
-OF_THE_DRIVER = "the same for every model: test_contract.py has it for a Panda on each engine"
+OF_THE_DRIVER = "the same for every model: test_drivers.py has it for a Panda on each engine"
 
 
 class Models(RobotContract, left_out=dict.fromkeys(("lose", "restore", "freeze", "fail"), OF_THE_DRIVER)):
