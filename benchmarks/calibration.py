@@ -58,13 +58,13 @@ def run(quick: bool) -> Iterator[Table]:
     yield table
     sets = range(1 if quick else 6)
     table = Table("15 synthetic views with noise of 0.2 px", ("error of the arm", *columns))
-    for arm in ARM_ERRORS:
+    for arm in ARM_ERRORS[: 1 if quick else None]:
         for eye in RIGS.values():
             seen = [views(eye, poses(15, k), noise_px=0.2, arm=arm, seed=k) for k in sets]
             table.add(f"{1e3 * arm:g} mm, {eye}", *ranges([error(solve(one, eye)) for one in seen]))
     yield table
     table = Table("the same in the hand, arm 0.2 mm off", ("camera matrix", *columns, "the board appears larger by, %"))
-    for what, believed in WRONG_K.items():
+    for what, believed in list(WRONG_K.items())[: 1 if quick else None]:
         seen = [views("in-hand", poses(15, k), noise_px=0.2, arm=2e-4, seed=k, believed=believed) for k in sets]
         found = [solve(one, "in-hand") for one in seen]
         table.add(what, *ranges([error(one) for one in found]), 100 * np.mean([one.uncertainty.scale for one in found]))

@@ -339,7 +339,7 @@ def run(quick: bool) -> Iterator[Table]:
     poses = 10 if quick else 10_000
     yield compare(f"verdicts in {poses} random positions", {model: verdicts(model, poses) for model in models})
     yield compare("`move_to` into the table and into the arm itself", {"": targets(4 if quick else 1000)})
-    each = {name: starts(name, 60) for name in ARMS} if not quick else {"so101": starts("so101", 1)}
+    each = {name: starts(name, 60) for name in ARMS} if not quick else {"panda": starts("panda", 1)}
     yield compare("`move_to(home)` from inside a margin", each)
     yield compare("two arms driven at each other at 0.25 m/s", {"": arms(1 if quick else 100)})
     yield tick(100 if quick else 2000)

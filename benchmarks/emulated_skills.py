@@ -167,7 +167,7 @@ def run(quick: bool) -> Iterator[Table]:
     columns = ("", "succeed; others", "width, mm: median, least, greatest", "off the goal, mm: median, greatest")
     table = Table(f"pick and place, {tries} tries each, engine {ENGINES[0]}", columns)
     for name, bench in list(BENCHES.items())[: 1 if quick else 3]:
-        for how, emulated in (("simulated", False), ("emulated", True)):
+        for how, emulated in (("simulated", False), ("emulated", True))[quick:]:
             with open_bench(bench, ENGINES[0], emulated, "--lockstep") as rig:
                 found = list(pick_and_place(rig, bench, tries))
             widths = [1e3 * each.width for each in found if not each.reason] or [np.nan]

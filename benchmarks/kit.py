@@ -18,23 +18,6 @@ import numpy as np
 import hal
 from hal import registry
 
-__all__ = [
-    "ENGINES",
-    "ROOT",
-    "Table",
-    "compare",
-    "cpu",
-    "emulated_franka",
-    "median",
-    "median_ratio",
-    "ms",
-    "per_second",
-    "run_in_turns",
-    "sum_of_programs",
-    "ticks_missed",
-    "timed",
-]
-
 ROOT = Path(__file__).resolve().parents[1]
 ENGINES = tuple(name for name in registry.ENGINES if not registry.find_missing(name))
 """The engines of the simulation that are installed."""

@@ -56,41 +56,47 @@ def entries(model: str) -> Iterator[dict[str, Any]]:
         yield {"model": model} | ({"arm": arm} if arm else {})
 
 
-def run_model(entry: dict[str, Any], engine: str, poses: int = 100, tour: float = 1.0) -> ModelRun:
-    """Return what an arm does alone in a world.
+def open_model(entry: dict[str, Any], engine: str) -> hal.Rig:
+    """Open a rig with an arm alone in a world, and the recorded tour as its pad.
 
     Args:
         entry: The arm's entry in a rig.
         engine: Name of the engine.
+    """
+    config = {"sim": True, "robots": {"arm": entry}, "gamepads": {"pad": {}}}
+    return hal.open(config, engine=engine, clock="lock_step", pad=TOUR)
+
+
+def drive_model(rig: hal.Rig, poses: int, tour: float) -> ModelRun:
+    """Return what the arm of a rig does.
+
+    Args:
+        rig: That of :func:`open_model`.
         poses: Number of random poses for inverse kinematics.
         tour: Share of the recorded tour that is driven.
     """
-    result = ModelRun()
-    config = {"sim": True, "robots": {"arm": entry}, "gamepads": {"pad": {}}}
-    with hal.open(config, engine=engine, clock="lock_step", pad=TOUR) as rig:
-        arm, pad = rig.robots["arm"], rig.gamepads["pad"]
-        result.notes = tuple(rig.notes)
-        solve_poses(arm, result, poses)
-        teleop = hal.Teleop(arm)
-        deadman = pad.hold(teleop.mapping.deadman)
-        start, length = arm.state().tcp, tour * 60.0
-        with arm.control(deadman=deadman, rate_hz=RATE_HZ) as control:
-            for tick in rig.clock.rate(RATE_HZ):
-                motion, grip = teleop.step(pad.state(), tick.dt)
-                control.send(motion, grip=grip)
-                state = arm.state()
-                result.lag = max(result.lag, float(abs(state.q - state.q_set).max()))
-                result.moved = max(result.moved, start.distance(state.tcp)[0])
-                result.seconds += 1.0 / RATE_HZ
-                if state.trip is not Trip.NONE:
-                    result.trip = state.trip
-                    break
-                if pad.finished or result.seconds >= length:
-                    break
-        gripper = arm.gripper
-        if gripper is not None:
-            result.widths = gripper.open().width, gripper.move(gripper.width_min).width
-            result.width_min = gripper.width_min
+    arm, pad, result = rig.robots["arm"], rig.gamepads["pad"], ModelRun(notes=tuple(rig.notes))
+    solve_poses(arm, result, poses)
+    teleop = hal.Teleop(arm)
+    deadman = pad.hold(teleop.mapping.deadman)
+    start, length = arm.state().tcp, tour * 60.0
+    with arm.control(deadman=deadman, rate_hz=RATE_HZ) as control:
+        for tick in rig.clock.rate(RATE_HZ):
+            motion, grip = teleop.step(pad.state(), tick.dt)
+            control.send(motion, grip=grip)
+            state = arm.state()
+            result.lag = max(result.lag, float(abs(state.q - state.q_set).max()))
+            result.moved = max(result.moved, start.distance(state.tcp)[0])
+            result.seconds += 1.0 / RATE_HZ
+            if state.trip is not Trip.NONE:
+                result.trip = state.trip
+                break
+            if pad.finished or result.seconds >= length:
+                break
+    gripper = arm.gripper
+    if gripper is not None:
+        result.widths = gripper.open().width, gripper.move(gripper.width_min).width
+        result.width_min = gripper.width_min
     return result
 
 
@@ -121,7 +127,8 @@ def run(quick: bool) -> Iterator[Table]:
     for entry in (entry for model in models for entry in entries(model)):
         for engine in ENGINES:
             try:
-                found = run_model(entry, engine, poses, tour)
+                with open_model(entry, engine) as rig:
+                    found = drive_model(rig, poses, tour)
             except ConfigError as error:
                 if not all(problem.code == "missing_package" for problem in error.problems):
                     raise

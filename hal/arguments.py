@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import CommandError
 
-__all__ = ["freeze", "number", "vector", "integer"]
-
 Array = NDArray[np.float64]
 
 

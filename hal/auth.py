@@ -13,8 +13,6 @@ import re
 import socket
 from collections.abc import Collection
 
-__all__ = ["PROTOCOL", "Authenticator", "host_names", "is_loopback", "page_link", "ssh_tunnel"]
-
 PROTOCOL = "hal.v1"
 """The WebSocket subprotocol; the token follows it in the list that a page offers."""
 _HOST = re.compile(r"(?:\[(?P<v6>[0-9a-f:.]+)\]|(?P<name>[a-z0-9._-]+))(?::\d{1,5})?", re.ASCII | re.IGNORECASE)

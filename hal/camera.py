@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from .driver import CameraDriver, CameraInfo, RawFrame
     from .robot import Robot
 
-__all__ = ["Camera", "CameraCounts", "MovingCamera", "frame_from_color", "find_place"]
-
 _LOG = logging.getLogger("hal.camera")
 _GRAB = 0.1
 """Longest wait for a frame in the camera's thread before it checks whether to end, s."""

@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 from .arguments import number
 
-__all__ = ["Clock", "LockStepClock", "RealClock", "Tick", "describe_load"]
-
 _ROUNDING = 1e-9
 _LONGEST = 1e9
 """Greatest time of a sleep, s."""

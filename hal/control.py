@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from .robot import Robot
     from .servo.controllers import Controller
 
-__all__ = ["Control"]
-
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
 """Deadline of the next command after one: so many periods of the session's rate, at least the shortest, s."""

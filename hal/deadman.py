@@ -10,8 +10,6 @@ from .commands import DeadmanRecord
 from .errors import NotSupported
 from .servo.watchdog import PAD_SILENCE, is_alive
 
-__all__ = ["Deadman", "Threshold"]
-
 Sink = Callable[[DeadmanRecord], None]
 
 

@@ -36,8 +36,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import freeze
 from .errors import Fault, NotSupported
-from .geometry import Pose, freeze
+from .geometry import Pose
 from .types import STREAMS, GripperOutcome
 
 if TYPE_CHECKING:

@@ -23,8 +23,6 @@ from .kinematics.urdf import read_urdf
 if TYPE_CHECKING:
     from .specs import KinematicsSpec, PayloadSpec, RobotSpec, Vector3
 
-__all__ = ["STANDARD_GRAVITY", "Dynamics"]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float] | Array
 

@@ -7,8 +7,6 @@ from math import dist, inf
 
 from .errors import Fault
 
-__all__ = ["Following"]
-
 Floats = Sequence[float]
 
 

@@ -20,17 +20,6 @@ from .types import AXES, BUTTONS, PadState, Stamp
 if TYPE_CHECKING:
     from .driver import GamepadDriver
 
-__all__ = [
-    "CONTROL_NAMES",
-    "Gamepad",
-    "HeldControl",
-    "NeutralGate",
-    "RUMBLE_SECONDS",
-    "RUMBLE_STRONG",
-    "RUMBLE_WEAK",
-    "apply_dead_zone",
-]
-
 RUMBLE_STRONG, RUMBLE_WEAK, RUMBLE_SECONDS = 1.0, 0.5, 0.5
 """Default rumble: power of the heavy and of the light motor (0..1), and duration in s. A driver that has to prepare a
 rumble prepares this one, so that a trip is felt at once."""

@@ -16,21 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from .arguments import freeze, vector
 from .errors import CommandError
 
-__all__ = [
-    "Pose",
-    "Transform",
-    "apply_rotation",
-    "compose",
-    "difference",
-    "freeze",
-    "inverse",
-    "matrix_to_quaternion",
-    "quaternion_to_matrix",
-    "rotate",
-    "rpy_to_matrix",
-    "tcp_pose",
-]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

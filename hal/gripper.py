@@ -16,12 +16,6 @@ if TYPE_CHECKING:
     from .host.hosts import Host
     from .specs import GripperSpec
 
-__all__ = [
-    "Gripper",
-    "GripperMotion",
-    "GripperResult",
-]
-
 _SHORTEST_WAIT = 0.01
 """Shortest time between two checks of a motion, s."""
 _PATIENCE = 2.0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["Histogram"]
-
 
 class Histogram:
     """Counts durations in bins; a percentile is the upper edge of its bin, so it is never too small.

@@ -13,17 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "Crop",
-    "Cropping",
-    "Intrinsics",
-    "centre_crop",
-    "depth_to_points",
-    "distort_points",
-    "from_field_of_view",
-    "undistort_pixels",
-]
-
 Array = NDArray[np.float64]
 
 _ROUNDS = 100

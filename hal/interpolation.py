@@ -13,8 +13,6 @@ from .geometry import Pose, apply_rotation, difference
 from .host.memory import History
 from .types import GripperState, RobotState, Stamp
 
-__all__ = ["robot_at", "gripper_at"]
-
 Array = NDArray[np.float64]
 AnyState = TypeVar("AnyState", RobotState, GripperState)
 

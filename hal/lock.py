@@ -11,8 +11,6 @@ from pathlib import Path
 
 from .errors import ControlTaken
 
-__all__ = ["APP_MARK", "DeviceLock"]
-
 APP_MARK = "hal-app="
 """Argument of a device's own process, followed by the process number of the program that started it."""
 _LONGEST = 100

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from .gripper import Gripper
     from .rig import Rig
 
-__all__ = ["Moment", "Observation", "Observer"]
-
 _NONE: Mapping[str, RobotState] = MappingProxyType({})
 _FRESH = 0.2
 """Age from which a frame is too old, so that the next one is waited for, s."""

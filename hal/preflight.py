@@ -21,20 +21,6 @@ from .specs import CameraSpec, RobotSpec
 if TYPE_CHECKING:
     from .specs import Plan
 
-__all__ = [
-    "CameraCheck",
-    "Check",
-    "CheckResult",
-    "Level",
-    "REALTIME_RIGHT",
-    "check_machine",
-    "list_checked_cameras",
-    "has_realtime_kernel",
-    "may_lock_memory",
-    "preflight",
-    "list_real_arms",
-]
-
 Level = Literal["ok", "warn", "fail", "unknown"]
 """``warn``: it may work. ``fail``: it will not. ``unknown``: it could not be checked, which is not ``ok``."""
 

@@ -14,8 +14,6 @@ import pytest
 if TYPE_CHECKING:
     from .rig import Rig
 
-__all__ = ["mock_rig", "mock_rig_config"]
-
 
 @pytest.fixture
 def mock_rig_config() -> Any:

@@ -21,17 +21,6 @@ from .errors import CommandError
 from .geometry import Pose
 from .specs import BodySpec, CameraSpec, RandomizeSpec, VariationSpec, ViewSpec, WorldSpec
 
-__all__ = [
-    "COUNT",
-    "DISTRACTORS",
-    "LIGHTS",
-    "TEXTURES",
-    "Randomizer",
-    "draw_values",
-    "list_distractors",
-    "vary_camera",
-]
-
 TEXTURES = ("checker", "gradient", "marble", "noise", "stripes", "wood")
 """Names of the built-in textures."""
 LIGHTS = 3
@@ -99,7 +88,7 @@ def _widen(K: Any, scale: float) -> Any:
     return (fx / scale, skew / scale, cx), (zero, fy / scale, cy), last
 
 
-class VariedWorld(Protocol):
+class _VariedWorld(Protocol):
     """What is needed of a :class:`hal.world.World`."""
 
     @property
@@ -158,7 +147,7 @@ class Randomizer:
             for number, low, high in zip(numbers, variation.lower, variation.upper, strict=True)
         )
 
-    def apply(self, world: VariedWorld, record: dict[str, Any] | None) -> dict[str, Any]:
+    def apply(self, world: _VariedWorld, record: dict[str, Any] | None) -> dict[str, Any]:
         """Restore the dynamics and objects of the rig file, then apply those of ``record``.
 
         Returns:
@@ -189,7 +178,7 @@ class Randomizer:
                     self._scale(world, name, links, _SCALED[what], value)
         return {"values": dict(values), "seed": 0 if record is None else record["seed"]}
 
-    def _scale(self, world: VariedWorld, name: str, links: Iterable[str], quantity: str, factor: float) -> None:
+    def _scale(self, world: _VariedWorld, name: str, links: Iterable[str], quantity: str, factor: float) -> None:
         for link in links:
             before = world.dynamics(name, link)[quantity]
             if before:

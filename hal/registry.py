@@ -24,27 +24,6 @@ from typing import Any, Literal
 
 from .errors import DeviceNotFound, DriverMissing, NotSupported
 
-__all__ = [
-    "BUILT_IN",
-    "ENGINES",
-    "GROUP",
-    "SIMULATION",
-    "DriverSpec",
-    "PadInput",
-    "check_engine",
-    "check_record",
-    "choose_engine",
-    "driver",
-    "function",
-    "is_engine",
-    "load",
-    "find_missing",
-    "names",
-    "pad_driver",
-    "provider",
-    "versions",
-]
-
 PadInput = Literal["plugged", "console", "keys", "recording", "program"]
 """Source of a gamepad's input: a pad that is plugged in, the console's page, the keys of the terminal, a recording, or
 the program itself."""

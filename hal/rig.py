@@ -34,13 +34,6 @@ if TYPE_CHECKING:
     from .specs import Plan
     from .views import CameraRenderer, Viewer, Viewer3D
 
-__all__ = [
-    "Devices",
-    "Rig",
-    "SharedStates",
-    "open_rig",
-]
-
 T = TypeVar("T")
 _FIRST_FRAME = 5.0
 """Longest wait for a camera's first frame, s."""

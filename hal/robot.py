@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import number, vector
+from .arguments import freeze, number, vector
 from .clock import describe_load
 from .control import Control, check_deadman
 from .errors import CommandError, ConnectionLost, NotSupported, StaleStateError
-from .geometry import Pose, freeze, tcp_pose
+from .geometry import Pose, tcp_pose
 from .motion.handle import CHECK_HZ, ArmMotion
 from .specs import CollisionSpec
 from .types import RobotState, RobotStatus
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from .motion.planning import MotionPlan, PathPlanner
     from .servo.controllers import Controller
     from .specs import LimitsSpec, RobotSpec
-
-__all__ = ["Robot"]
 
 _MOVED = 0.02
 """A set-point at rest that is farther than this from the arm is an old one, rad: the arm was moved by hand."""

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from .robot import Robot
     from .types import PadState, RobotState
 
-__all__ = ["SessionEvent", "SessionEventKind", "TeleopSession"]
-
 RATE_HZ = 50.0
 """Rate at which commands are sent, Hz, beside those for changes of the pad."""
 RETRY_DELAY = 0.1

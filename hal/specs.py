@@ -14,31 +14,6 @@ from typing import Any, TypeVar
 
 from .types import STREAMS
 
-__all__ = [
-    "BodySpec",
-    "BoxSpec",
-    "CameraSpec",
-    "CollisionSpec",
-    "DepthSensorSpec",
-    "GripperSpec",
-    "GroupSpec",
-    "KinematicsSpec",
-    "LimitsSpec",
-    "PadSpec",
-    "PayloadSpec",
-    "Plan",
-    "RandomizeSpec",
-    "RangesSpec",
-    "RobotSpec",
-    "SensorSpec",
-    "VariationSpec",
-    "ViewSpec",
-    "WorkspaceSpec",
-    "WorldSpec",
-    "from_json",
-    "to_json",
-]
-
 Floats = tuple[float, ...]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

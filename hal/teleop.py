@@ -22,14 +22,6 @@ if TYPE_CHECKING:
     from .types import RobotState
     from .views import Viewer3D
 
-__all__ = [
-    "ArmTeleop",
-    "SessionEventKind",
-    "Teleop",
-    "share_pads",
-    "twist_towards",
-]
-
 _CROSSED = 0.05
 """Distance between trigger and grip at which the trigger counts as having reached it, as a share of the travel."""
 _HALF = 0.5

@@ -18,28 +18,6 @@ from numpy.typing import DTypeLike, NDArray
 from .errors import CommandError, Fault, NotSupported
 from .geometry import Pose
 
-__all__ = [
-    "AXES",
-    "BUTTONS",
-    "CAP_AXES",
-    "ControlMode",
-    "Fault",
-    "Frame",
-    "GripperOutcome",
-    "GripperState",
-    "ImageStream",
-    "Limited",
-    "ONE_SIDED",
-    "PadState",
-    "Pose",
-    "RobotState",
-    "RobotStatus",
-    "STICK_AXES",
-    "STREAMS",
-    "Stamp",
-    "Trip",
-]
-
 Array = NDArray[np.float64]
 
 STICK_AXES = ("left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y")

@@ -18,21 +18,6 @@ if TYPE_CHECKING:
     from .camera import Camera
     from .rig import Rig
 
-__all__ = [
-    "ACTIONS",
-    "Console",
-    "DrivingView",
-    "Listen",
-    "PHASES",
-    "PORT",
-    "CameraRenderer",
-    "RecordingView",
-    "SETTINGS",
-    "WorldView",
-    "Viewer",
-    "Viewer3D",
-]
-
 LOOPBACK = "127.0.0.1"
 PORT = 8470
 """Default port of the console; the next free one if it is taken."""

@@ -16,12 +16,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .arguments import freeze
 from .errors import CommandError, NotSupported
-from .geometry import Pose, freeze
+from .geometry import Pose
 from .randomization import Randomizer
 from .specs import BodySpec, WorldSpec, from_json, to_json
-
-__all__ = ["BodyJoint", "Contact", "Contacts", "NoWorld", "Poses", "RayHit", "World", "WorldDriver", "WorldState"]
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
-"""Frames of Damiao motors: pure functions that encode and decode every command and reply. No bus, no time.
+"""Frames of Damiao motors: pure functions that encode commands and decode replies. No bus, no time.
 
-The driver encodes commands and decodes replies; the emulator does the opposite with the same functions.
+The motor's own side is in the emulator.
 
 A motor listens at its own id. Whatever it is sent, it answers with one feedback frame at its master id. Frames have
 8 bytes. In commands and feedback, numbers are unsigned integers of 12 or 16 bits, big-endian, that map linearly onto
@@ -37,15 +37,13 @@ ENABLE = b"\xff" * 7 + b"\xfc"
 """Data of the command that switches a motor on. It then holds nothing until it gets its first command."""
 DISABLE = b"\xff" * 7 + b"\xfd"
 """Data of the command that switches a motor off: it applies no torque any more."""
-SET_ZERO = b"\xff" * 7 + b"\xfe"
-"""Data of the command that makes the present position the zero."""
 CLEAR_ERROR = b"\xff" * 7 + b"\xfb"
 """Data of the command that clears an error; the motor is then off."""
 TIMEOUT_UNIT = 50e-6
 """Unit of the register TIMEOUT, s."""
 MIT_MODE = 1
 """Value of the register CTRL_MODE in which commands have position, velocity, gains and torque."""
-READ_REGISTER, WRITE_REGISTER, SAVE_REGISTERS, STATE_REQUEST = 0x33, 0x55, 0xAA, 0xCC
+READ_REGISTER, WRITE_REGISTER, STATE_REQUEST = 0x33, 0x55, 0xCC
 """Operations at REGISTER_ID: the third byte of a request."""
 
 
@@ -117,18 +115,8 @@ class MotorRegister(IntEnum):
     """Code of the bit rate: 0..9 for 125k, 200k, 250k, 500k, 1M, 2M, 2.5M, 3.2M, 4M, 5M."""
 
 
-_INTEGERS = frozenset({*range(7, 11), *range(13, 17), 35, 36})
+INTEGER_REGISTERS = frozenset({*range(7, 11), *range(13, 17), 35, 36})
 """Registers that hold a uint32; the others hold a float32."""
-
-
-class MotorCommand(NamedTuple):
-    """Content of a command in MIT mode, on the motor's side: without direction and offset of a joint."""
-
-    q: float
-    dq: float
-    kp: float
-    kd: float
-    tau: float
 
 
 class MotorFeedback(NamedTuple):
@@ -148,7 +136,7 @@ class MotorFeedback(NamedTuple):
 
 
 class MotorCodec:
-    """Encoder and decoder of the commands and the feedback of motors with one range.
+    """Encoder of the commands, and decoder of the feedback, of motors with one range.
 
     Values beyond the range are clamped. A number is truncated to the next lower step, so zero is half a step below
     zero (0x7FFF, 0x7FF), and a value comes back at most one step lower.
@@ -184,44 +172,13 @@ class MotorCodec:
         damping = 4095 if kd >= KD_MAX else 0 if kd <= 0.0 else int(kd * 4095.0 / KD_MAX)
         return (position << 48 | velocity << 36 | stiffness << 24 | damping << 12 | torque).to_bytes(8, "big")
 
-    def decode_command(self, data: bytes | bytearray) -> MotorCommand:
-        """Return the content of a command; its special forms (:data:`ENABLE`, ...) have to be recognised before.
-
-        Raises:
-            ValueError: It has not 8 bytes.
-        """
-        bits = _bits(data)
-        return MotorCommand(
-            (bits >> 48) * self._p_step - self._p,
-            (bits >> 36 & 0xFFF) * self._v_step - self._v,
-            (bits >> 24 & 0xFFF) * (KP_MAX / 4095.0),
-            (bits >> 12 & 0xFFF) * (KD_MAX / 4095.0),
-            (bits & 0xFFF) * self._t_step - self._t,
-        )
-
-    def encode_feedback(
-        self, motor: int, status: int, q: float, dq: float, tau: float, mosfet: int = 30, rotor: int = 30
-    ) -> bytes:
-        """Return the data of a feedback frame; ``motor`` is the motor's id, the others are as in MotorFeedback.
-
-        Raises:
-            ValueError: A number is NaN.
-        """
-        p, v, t = self._p, self._v, self._t
-        position = 65535 if q >= p else 0 if q <= -p else int((q + p) * 65535.0 / self._p2)
-        velocity = 4095 if dq >= v else 0 if dq <= -v else int((dq + v) * 4095.0 / self._v2)
-        torque = 4095 if tau >= t else 0 if tau <= -t else int((tau + t) * 4095.0 / self._t2)
-        head = (status & 15) << 60 | (motor & 15) << 56
-        heat = min(max(int(mosfet), 0), 255) << 8 | min(max(int(rotor), 0), 255)
-        return (head | position << 40 | velocity << 28 | torque << 16 | heat).to_bytes(8, "big")
-
     def decode_feedback(self, data: bytes | bytearray) -> MotorFeedback:
         """Return the content of a feedback frame.
 
         Raises:
             ValueError: It has not 8 bytes.
         """
-        bits = _bits(data)
+        bits = read_bits(data)
         return MotorFeedback(
             bits >> 56 & 15,
             bits >> 60,
@@ -233,25 +190,14 @@ class MotorCodec:
         )
 
 
-def _bits(data: bytes | bytearray) -> int:
+def read_bits(data: bytes | bytearray) -> int:
+    """Return the 8 bytes of a frame as one number. Raises ValueError for another length."""
     if len(data) != 8:
         raise ValueError(f"a frame of a Damiao motor has 8 bytes, not {len(data)}")
     return int.from_bytes(data, "big")
 
 
 # Registers. Requests and replies: id low, id high, operation, register, then its value in 4 bytes, little-endian.
-
-
-class RegisterRequest(NamedTuple):
-    """A request at REGISTER_ID."""
-
-    motor: int
-    """Id of the motor that it is for."""
-    operation: int
-    """READ_REGISTER, WRITE_REGISTER, SAVE_REGISTERS or STATE_REQUEST; others are not documented."""
-    register: int
-    value: float
-    """New value, when writing; an int where the register holds one."""
 
 
 class RegisterReply(NamedTuple):
@@ -272,30 +218,6 @@ def encode_register_read(motor: int, register: int) -> bytes:
     return bytes((motor & 0xFF, motor >> 8, READ_REGISTER, register, 0, 0, 0, 0))
 
 
-def encode_register_write(motor: int, register: int, value: float) -> bytes:
-    """Return the data of a request to change a register, to be sent to REGISTER_ID. It lasts until power is cut."""
-    return bytes((motor & 0xFF, motor >> 8, WRITE_REGISTER, register)) + _pack(register, value)
-
-
-def encode_save(motor: int) -> bytes:
-    """Return the data of a request to keep all registers without power, to be sent to REGISTER_ID."""
-    return bytes((motor & 0xFF, motor >> 8, SAVE_REGISTERS, 1, 0, 0, 0, 0))
-
-
-def encode_register_reply(motor: int, register: int, value: float, operation: int = READ_REGISTER) -> bytes:
-    """Return the data of the reply, at the master id, to a request with this ``operation``."""
-    return bytes((motor & 0xFF, motor >> 8, operation, register)) + _pack(register, value)
-
-
-def decode_register_request(data: bytes | bytearray) -> RegisterRequest | None:
-    """Return the content of a request at REGISTER_ID; None for a frame with less than 3 bytes."""
-    if len(data) < 3:
-        return None
-    padded = bytes(data).ljust(8, b"\0")
-    register = padded[3]
-    return RegisterRequest(padded[0] | padded[1] << 8, padded[2], register, _unpack(register, padded[4:8]))
-
-
 def decode_register_reply(data: bytes | bytearray, motor: int) -> RegisterReply | None:
     """Return the content of a register's reply; None for every other frame.
 
@@ -307,14 +229,11 @@ def decode_register_reply(data: bytes | bytearray, motor: int) -> RegisterReply 
         motor: The motor's id.
     """
     if len(data) == 8 and data[2] in (READ_REGISTER, WRITE_REGISTER) and data[0] | data[1] << 8 == motor:
-        return RegisterReply(data[3], _unpack(data[3], bytes(data[4:8])))
+        return RegisterReply(data[3], unpack_register(data[3], bytes(data[4:8])))
     return None
 
 
-def _pack(register: int, value: float) -> bytes:
-    return struct.pack("<I", int(value)) if register in _INTEGERS else struct.pack("<f", value)
-
-
-def _unpack(register: int, data: bytes) -> float:
-    value: float = struct.unpack("<I" if register in _INTEGERS else "<f", data)[0]
+def unpack_register(register: int, data: bytes) -> float:
+    """Return a register's value from its 4 bytes."""
+    value: float = struct.unpack("<I" if register in INTEGER_REGISTERS else "<f", data)[0]
     return value

@@ -1,18 +1,18 @@
-"""Frames of an AgileX PiPER arm and its gripper, in both directions: pure functions and records, no bus.
+"""Frames of an AgileX PiPER arm and its gripper: pure functions and records, no bus.
 
 The arm has a controller on board, which takes position targets and reports its state without being asked. Frames are
 classic CAN with 11-bit ids and at most 8 bytes; numbers are big-endian integers. The layouts are those of the vendor's
 ``piper_sdk`` (protocol V2, firmware V1.5-2 and later), and are tested against it.
 
-Records hold SI units and radians. ``frame()`` encodes a record; :func:`decode_command` (for an emulator) and
-:func:`decode_feedback` (for the driver) are the reverse. A number that is not finite, or that its field cannot hold,
-raises ValueError: nothing is clamped here.
+Records hold SI units and radians. ``frame()`` encodes a command, and :func:`decode_feedback` reads a report; the arm's
+own side is in the emulator. A number that is not finite, or that its field cannot hold, raises ValueError: nothing is
+clamped here.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import pi
 from typing import NamedTuple
 
@@ -56,29 +56,40 @@ HOMED = 0x80
 TORQUE_PER_AMPERE = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)
 """Joint torque over motor current, Nm/A, by piper_sdk; the manual of pyAgxArm has 4 times that for joints 1 to 3."""
 
-_STOP, _MODE, _TARGETS, _GRIPPER = 0x150, 0x151, 0x155, 0x159
-_ENABLE, _LIMIT_QUERY, _LIMITS, _JOINT = 0x471, 0x472, 0x473, 0x475
-_PARAMETER_QUERY, _ACCELERATION, _STROKE = 0x477, 0x47C, 0x47E
-_STATUS, _POSE, _ANGLES, _GRIPPER_STATUS, _MOTION, _MOTOR_STATUS = 0x2A1, 0x2A2, 0x2A5, 0x2A8, 0x251, 0x261
+STOP_ID, MODE_ID, TARGETS_ID, GRIPPER_ID = 0x150, 0x151, 0x155, 0x159
+ENABLE_ID, LIMIT_QUERY_ID, LIMITS_ID, JOINT_ID = 0x471, 0x472, 0x473, 0x475
+PARAMETER_QUERY_ID, ACCELERATION_ID, STROKE_ID = 0x477, 0x47C, 0x47E
+STATUS_ID, POSE_ID, ANGLES_ID, GRIPPER_STATUS_ID, MOTION_ID, MOTOR_STATUS_ID = 0x2A1, 0x2A2, 0x2A5, 0x2A8, 0x251, 0x261
 ACKNOWLEDGEMENT = 0x476
 """Id of the answer to a command with an id of 0x470 and above."""
 FIRMWARE = 0x4AF
 """Id of both the question for the firmware's version and its answer."""
+COMMAND_IDS = (
+    MODE_ID,
+    *range(TARGETS_ID, TARGETS_ID + JOINTS // 2),
+    GRIPPER_ID,
+    ENABLE_ID,
+    LIMIT_QUERY_ID,
+    JOINT_ID,
+    PARAMETER_QUERY_ID,
+    FIRMWARE,
+)
+"""Ids of the commands that this package sends."""
 FEEDBACK_IDS = (
-    *range(_MOTION, _MOTION + JOINTS),
-    *range(_MOTOR_STATUS, _MOTOR_STATUS + JOINTS),
-    *range(_STATUS, _GRIPPER_STATUS + 1),
+    *range(MOTION_ID, MOTION_ID + JOINTS),
+    *range(MOTOR_STATUS_ID, MOTOR_STATUS_ID + JOINTS),
+    *range(STATUS_ID, GRIPPER_STATUS_ID + 1),
 )
 """Ids of the frames that the arm and its gripper send without being asked."""
-GRIPPER_IDS = (_GRIPPER_STATUS,)
+GRIPPER_IDS = (GRIPPER_STATUS_ID,)
 """Those of them that are the gripper's."""
 
-PARAMETER_IDS = (_LIMITS, _ACCELERATION, _STROKE, ACKNOWLEDGEMENT, FIRMWARE)
+PARAMETER_IDS = (LIMITS_ID, ACCELERATION_ID, STROKE_ID, ACKNOWLEDGEMENT, FIRMWARE)
 """Ids of the answers to questions and settings."""
 
-_MILLIDEGREES = 180_000.0 / pi
+MILLIDEGREES = 180_000.0 / pi
 """Millidegrees per radian."""
-_SET = 0xAE
+SET = 0xAE
 """Value that makes a setting effective."""
 _PAIR = struct.Struct(">ii")
 
@@ -87,22 +98,6 @@ CanFrame = tuple[int, bytes]
 
 
 # Commands: what a program sends to the arm
-
-
-class EmergencyRequest(NamedTuple):
-    """Emergency stop, trajectory and teaching requests (0x150), which this package never sends.
-
-    ``resume`` cuts the power of the motors: a raised arm falls.
-    """
-
-    emergency: int
-    """0 nothing, 1 stop, 2 resume."""
-    trajectory: int
-    teaching: int
-
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _STOP, bytes((*self, 0, 0, 0, 0, 0))
 
 
 class ModeRequest(NamedTuple):
@@ -122,7 +117,7 @@ class ModeRequest(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
-        return _MODE, bytes((*self, 0, 0))
+        return MODE_ID, bytes((*self, 0, 0))
 
 
 class JointTargets(NamedTuple):
@@ -135,7 +130,7 @@ class JointTargets(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
-        return _TARGETS + self.first // 2, _pair(self.q, _MILLIDEGREES)
+        return TARGETS_ID + self.first // 2, pack_pair(self.q, MILLIDEGREES)
 
 
 class GripperRequest(NamedTuple):
@@ -153,7 +148,7 @@ class GripperRequest(NamedTuple):
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
         code = int(self.enabled) | int(self.clear_error) << 1
-        return _GRIPPER, _pack(">iHBB", self.width * 1e6, self.torque * 1e3, code, _SET if self.set_zero else 0)
+        return GRIPPER_ID, pack(">iHBB", self.width * 1e6, self.torque * 1e3, code, SET if self.set_zero else 0)
 
 
 class EnableRequest(NamedTuple):
@@ -165,7 +160,7 @@ class EnableRequest(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
-        return _ENABLE, bytes((self.motor, 2 if self.enabled else 1, 0, 0, 0, 0, 0, 0))
+        return ENABLE_ID, bytes((self.motor, 2 if self.enabled else 1, 0, 0, 0, 0, 0, 0))
 
 
 class LimitQuery(NamedTuple):
@@ -178,7 +173,7 @@ class LimitQuery(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record."""
-        return _LIMIT_QUERY, bytes((*self, 0, 0, 0, 0, 0, 0))
+        return LIMIT_QUERY_ID, bytes((*self, 0, 0, 0, 0, 0, 0))
 
 
 class JointRequest(NamedTuple):
@@ -191,8 +186,8 @@ class JointRequest(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record. The joint's acceleration stays as it is (0x7FFF)."""
-        zero, clear = (_SET if flag else 0 for flag in (self.set_zero, self.clear_error))
-        return _JOINT, bytes((self.motor, zero, 0, 0x7F, 0xFF, clear, 0, 0))
+        zero, clear = (SET if flag else 0 for flag in (self.set_zero, self.clear_error))
+        return JOINT_ID, bytes((self.motor, zero, 0, 0x7F, 0xFF, clear, 0, 0))
 
 
 class ParameterQuery(NamedTuple):
@@ -202,7 +197,7 @@ class ParameterQuery(NamedTuple):
 
     def frame(self) -> CanFrame:
         """Return the frame of this record. Nothing is set: 3 stands for an unchanged load."""
-        return _PARAMETER_QUERY, bytes((self.content, 0, 0, 0, 3, 0, 0, 0))
+        return PARAMETER_QUERY_ID, bytes((self.content, 0, 0, 0, 3, 0, 0, 0))
 
 
 class FirmwareQuery(NamedTuple):
@@ -214,8 +209,7 @@ class FirmwareQuery(NamedTuple):
 
 
 PiperCommand = (
-    EmergencyRequest
-    | ModeRequest
+    ModeRequest
     | JointTargets
     | GripperRequest
     | EnableRequest
@@ -228,35 +222,7 @@ PiperCommand = (
 
 def encode_joint_targets(q: Sequence[float]) -> list[CanFrame]:
     """Return the three frames of the targets (6,) of all joints, rad."""
-    return [(_TARGETS + k // 2, _pair(q[k : k + 2], _MILLIDEGREES)) for k in (0, 2, 4)]
-
-
-def decode_command(frame_id: int, data: bytes) -> PiperCommand | None:
-    """Return the command in a frame; None for any other frame, of this arm or not."""
-    decoder = _COMMANDS.get(frame_id)
-    return None if decoder is None or len(data) != 8 else decoder(frame_id, data)
-
-
-_COMMANDS: dict[int, Callable[[int, bytes], PiperCommand | None]] = {
-    _STOP: lambda _, data: EmergencyRequest(*data[:3]),
-    _MODE: lambda _, data: ModeRequest(*data[:6]),
-    _GRIPPER: lambda _, data: _gripper_request(*struct.unpack(">iHBB", data)),
-    _ENABLE: lambda _, data: EnableRequest(data[0], data[1] == 2) if data[1] in (1, 2) else None,
-    _LIMIT_QUERY: lambda _, data: LimitQuery(*data[:2]),
-    _JOINT: lambda _, data: JointRequest(data[0], data[5] == _SET, data[1] == _SET),
-    _PARAMETER_QUERY: lambda _, data: ParameterQuery(data[0]),
-    FIRMWARE: lambda _, data: FirmwareQuery() if (FIRMWARE, data) == FirmwareQuery().frame() else None,
-    **dict.fromkeys(
-        range(_TARGETS, _TARGETS + 3), lambda frame_id, data: JointTargets(2 * (frame_id - _TARGETS), _radians(data))
-    ),
-}
-
-COMMAND_IDS = tuple(frame_id for frame_id in _COMMANDS if frame_id != _STOP)
-"""Ids of the commands that this package sends."""
-
-
-def _gripper_request(width: int, torque: int, code: int, zero: int) -> GripperRequest:
-    return GripperRequest(width * 1e-6, torque * 1e-3, bool(code & 1), bool(code & 2), zero == _SET)
+    return [(TARGETS_ID + k // 2, pack_pair(q[k : k + 2], MILLIDEGREES)) for k in (0, 2, 4)]
 
 
 # Feedback: what the arm sends
@@ -279,23 +245,6 @@ class PiperStatus(NamedTuple):
     no_communication: int = 0
     """Bit k: the motor of joint k + 1 does not answer the arm's controller."""
 
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _STATUS, bytes(self)
-
-
-class PoseNumbers(NamedTuple):
-    """Two of the six numbers of the flange's pose (0x2A2 to 0x2A4): x, y; z, roll; pitch, yaw."""
-
-    first: int
-    """0, 2 or 4."""
-    values: tuple[float, float]
-    """m, exact to a micrometre, and rad, exact to 0.001 degrees."""
-
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _POSE + self.first // 2, _pair(self.values, *_POSE_SCALES[self.first])
-
 
 class JointAngles(NamedTuple):
     """Measured positions of two neighbouring joints (0x2A5 to 0x2A7), 200 times a second."""
@@ -304,10 +253,6 @@ class JointAngles(NamedTuple):
     """0, 2 or 4."""
     q: tuple[float, float]
     """rad, exact to 0.001 degrees."""
-
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _ANGLES + self.first // 2, _pair(self.q, _MILLIDEGREES)
 
 
 class GripperStatus(NamedTuple):
@@ -319,10 +264,6 @@ class GripperStatus(NamedTuple):
     """Torque of its motor, Nm."""
     flags: int = 0
     """ENABLED, HOMED, ERROR and so on."""
-
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _GRIPPER_STATUS, _pack(">ihBx", self.width * 1e6, self.torque * 1e3, self.flags)
 
 
 class JointMotion(NamedTuple):
@@ -336,10 +277,6 @@ class JointMotion(NamedTuple):
     """A, exact to 0.001. See ``TORQUE_PER_AMPERE``."""
     position: float = 0.0
     """rad, exact to 0.001. Real arms are reported to fill this field in different units: use :class:`JointAngles`."""
-
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _MOTION + self.joint, _pack(">hhi", *(value * 1e3 for value in self[1:]))
 
 
 class JointStatus(NamedTuple):
@@ -358,12 +295,6 @@ class JointStatus(NamedTuple):
     current: float = 0.0
     """Supply current, A; small motors always report 0."""
 
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        _, voltage, driver, motor, flags, current = self
-        data = _pack(">HhbBH", voltage * 10, driver, motor, flags, current * 1e3)
-        return _MOTOR_STATUS + self.joint, data
-
 
 class JointLimits(NamedTuple):
     """Range and speed of a joint as set in the arm (0x473)."""
@@ -377,36 +308,6 @@ class JointLimits(NamedTuple):
     velocity: float
     """rad/s, exact to 0.001."""
 
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        tenths = _MILLIDEGREES * 1e-2
-        return _LIMITS, _pack(">BhhHx", self.motor, self.upper * tenths, self.lower * tenths, self.velocity * 1e3)
-
-
-class AccelerationLimit(NamedTuple):
-    """Acceleration of a joint as set in the arm (0x47C)."""
-
-    motor: int
-    """1 to 6."""
-    acceleration: float
-    """rad/s2, exact to 0.001."""
-
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _ACCELERATION, _pack(">BH5x", self.motor, self.acceleration * 1e3)
-
-
-class Acknowledgement(NamedTuple):
-    """Answer to a command with an id of 0x470 and above (0x476)."""
-
-    command: int
-    """Last byte of the command's id."""
-    zero_set: bool = False
-
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return ACKNOWLEDGEMENT, bytes((self.command, int(self.zero_set), 0, 0, 0, 0, 0, 0))
-
 
 class GripperStroke(NamedTuple):
     """Parameters of the gripper (0x47E)."""
@@ -416,51 +317,16 @@ class GripperStroke(NamedTuple):
     teaching_percent: int = 100
     teaching_friction: int = 1
 
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return _STROKE, bytes((self.teaching_percent, self.stroke_mm, self.teaching_friction, 0, 0, 0, 0, 0))
-
 
 class FirmwarePiece(NamedTuple):
     """Piece of the answer to :class:`FirmwareQuery` (0x4AF); :func:`find_firmware` reads all pieces together."""
 
     text: bytes
 
-    def frame(self) -> CanFrame:
-        """Return the frame of this record."""
-        return FIRMWARE, self.text.ljust(8, b"\0")
-
 
 PiperFeedback = (
-    PiperStatus
-    | PoseNumbers
-    | JointAngles
-    | GripperStatus
-    | JointMotion
-    | JointStatus
-    | JointLimits
-    | AccelerationLimit
-    | Acknowledgement
-    | GripperStroke
-    | FirmwarePiece
+    PiperStatus | JointAngles | GripperStatus | JointMotion | JointStatus | JointLimits | GripperStroke | FirmwarePiece
 )
-
-
-def encode_joint_angles(q: Sequence[float]) -> list[CanFrame]:
-    """Return the three frames of the measured positions (6,) of all joints, rad."""
-    return [(_ANGLES + k // 2, _pair(q[k : k + 2], _MILLIDEGREES)) for k in (0, 2, 4)]
-
-
-def encode_pose(position: Sequence[float], roll_pitch_yaw: Sequence[float]) -> list[CanFrame]:
-    """Return the three frames of the flange's pose: position (3,), m, and roll, pitch, yaw, rad."""
-    values = (*position, *roll_pitch_yaw)
-    return [PoseNumbers(k, (values[k], values[k + 1])).frame() for k in (0, 2, 4)]
-
-
-def firmware_pieces(version: str) -> Iterator[CanFrame]:
-    """Yield the frames of an arm's answer to :class:`FirmwareQuery`, 8 characters each."""
-    text = version.encode("ascii")
-    return (FirmwarePiece(text[k : k + 8]).frame() for k in range(0, len(text), 8))
 
 
 def find_firmware(pieces: Iterable[bytes]) -> str | None:
@@ -479,12 +345,12 @@ def decode_feedback(frame_id: int, data: bytes) -> PiperFeedback | None:
 
 def _motion(frame_id: int, data: bytes) -> JointMotion:
     dq, current, position = struct.unpack(">hhi", data)
-    return JointMotion(frame_id - _MOTION, dq * 1e-3, current * 1e-3, position * 1e-3)
+    return JointMotion(frame_id - MOTION_ID, dq * 1e-3, current * 1e-3, position * 1e-3)
 
 
 def _motor_status(frame_id: int, data: bytes) -> JointStatus:
     voltage, driver, motor, flags, current = struct.unpack(">HhbBH", data)
-    return JointStatus(frame_id - _MOTOR_STATUS, voltage * 0.1, driver, motor, flags, current * 1e-3)
+    return JointStatus(frame_id - MOTOR_STATUS_ID, voltage * 0.1, driver, motor, flags, current * 1e-3)
 
 
 def _gripper_status(_: int, data: bytes) -> GripperStatus:
@@ -494,48 +360,40 @@ def _gripper_status(_: int, data: bytes) -> GripperStatus:
 
 def _limits(_: int, data: bytes) -> JointLimits:
     motor, upper, lower, velocity = struct.unpack(">BhhHx", data)
-    return JointLimits(motor, upper * 100 / _MILLIDEGREES, lower * 100 / _MILLIDEGREES, velocity * 1e-3)
-
-
-def _pose(frame_id: int, data: bytes) -> PoseNumbers:
-    first = 2 * (frame_id - _POSE)
-    values, scales = _PAIR.unpack(data), _POSE_SCALES[first]
-    return PoseNumbers(first, (values[0] / scales[0], values[1] / scales[1]))
+    return JointLimits(motor, upper * 100 / MILLIDEGREES, lower * 100 / MILLIDEGREES, velocity * 1e-3)
 
 
 _FEEDBACK: dict[int, Callable[[int, bytes], PiperFeedback | None]] = {
-    _STATUS: lambda _, data: PiperStatus(*data),
-    _GRIPPER_STATUS: _gripper_status,
-    _LIMITS: _limits,
-    _ACCELERATION: lambda _, data: AccelerationLimit(data[0], int.from_bytes(data[1:3], "big") * 1e-3),
-    ACKNOWLEDGEMENT: lambda _, data: Acknowledgement(data[0], data[1] == 1),
-    _STROKE: lambda _, data: GripperStroke(data[1], data[0], data[2]),
+    STATUS_ID: lambda _, data: PiperStatus(*data),
+    GRIPPER_STATUS_ID: _gripper_status,
+    LIMITS_ID: _limits,
+    STROKE_ID: lambda _, data: GripperStroke(data[1], data[0], data[2]),
     FIRMWARE: lambda _, data: None if (FIRMWARE, data) == FirmwareQuery().frame() else FirmwarePiece(data),
-    **dict.fromkeys(range(_POSE, _POSE + 3), _pose),
     **dict.fromkeys(
-        range(_ANGLES, _ANGLES + 3), lambda frame_id, data: JointAngles(2 * (frame_id - _ANGLES), _radians(data))
+        range(ANGLES_ID, ANGLES_ID + 3),
+        lambda frame_id, data: JointAngles(2 * (frame_id - ANGLES_ID), unpack_angles(data)),
     ),
-    **dict.fromkeys(range(_MOTION, _MOTION + JOINTS), _motion),
-    **dict.fromkeys(range(_MOTOR_STATUS, _MOTOR_STATUS + JOINTS), _motor_status),
+    **dict.fromkeys(range(MOTION_ID, MOTION_ID + JOINTS), _motion),
+    **dict.fromkeys(range(MOTOR_STATUS_ID, MOTOR_STATUS_ID + JOINTS), _motor_status),
 }
-_POSE_SCALES = {0: (1e6, 1e6), 2: (1e6, _MILLIDEGREES), 4: (_MILLIDEGREES, _MILLIDEGREES)}
 
 
 # Numbers
 
 
-def _pair(values: Sequence[float], scale: float, second: float | None = None) -> bytes:
+def pack_pair(values: Sequence[float], scale: float, second: float | None = None) -> bytes:
     """Return two numbers as integers of 32 bits, after multiplication by ``scale`` (and ``second``)."""
     a, b = values
-    return _pack(">ii", a * scale, b * (scale if second is None else second))
+    return pack(">ii", a * scale, b * (scale if second is None else second))
 
 
-def _radians(data: bytes) -> tuple[float, float]:
+def unpack_angles(data: bytes) -> tuple[float, float]:
+    """Return the two angles of a frame, rad."""
     a, b = _PAIR.unpack(data)
-    return a / _MILLIDEGREES, b / _MILLIDEGREES
+    return a / MILLIDEGREES, b / MILLIDEGREES
 
 
-def _pack(layout: str, *numbers: float) -> bytes:
+def pack(layout: str, *numbers: float) -> bytes:
     """Return the rounded numbers in a frame's layout. Raises ValueError for one that is not finite or does not fit."""
     try:
         return struct.pack(layout, *map(round, numbers))

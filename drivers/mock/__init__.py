@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from hal.registry import DriverSpec
 
-__all__ = ["DRIVER"]
-
 DRIVER = DriverSpec(
     name="mock",
     robot="hal.drivers.mock.robot:MockRobot",

@@ -17,8 +17,6 @@ from hal.specs import CameraSpec
 
 from .faults import MockCameraFaults, change_faults
 
-__all__ = ["PLANE", "SQUARE", "STEP", "MockCamera", "PictureStamp", "read_picture"]
-
 PLANE = 1.0
 """Distance of the background from the camera, m (or the camera's farthest depth, where that is nearer)."""
 SQUARE = 16

@@ -9,8 +9,6 @@ from typing import TypeVar
 
 from hal.errors import CommandError
 
-__all__ = ["FIELDS", "MockCameraFaults", "MockGripperFaults", "MockPadFaults", "MockRobotFaults", "change_faults"]
-
 
 @dataclass(frozen=True)
 class MockRobotFaults:

@@ -14,8 +14,6 @@ from hal.types import AXES, BUTTONS, ONE_SIDED
 
 from .faults import MockPadFaults, change_faults
 
-__all__ = ["MockPad"]
-
 _TRIGGERS = tuple(name for name in BUTTONS if name in AXES)
 _TRIGGER_PRESSED = 0.1  # travel from which on a trigger, which is also a button, counts as pressed
 

@@ -18,8 +18,6 @@ from hal.types import GripperOutcome
 
 from .faults import MockGripperFaults, MockRobotFaults, change_faults
 
-__all__ = ["FRICTION", "INERTIA", "KEEP_UP", "LOG_LENGTH", "MockGripper", "MockRobot"]
-
 LOG_LENGTH = 100_000
 """Number of set-points that ``MockRobot.log`` keeps: 100 s of the fastest arm."""
 INERTIA = 1.0

@@ -14,19 +14,6 @@ from hal.drivers.scene.values import BOUNCE
 
 from .engine import Body, LinkContact
 
-__all__ = [
-    "CARRIED",
-    "ContactParameters",
-    "add_pairs",
-    "bounding_box",
-    "cast_ray",
-    "contact_parameters",
-    "deepest_overlap",
-    "distance",
-    "find_contacts",
-    "friction_pairs",
-]
-
 Array = NDArray[np.float64]
 
 USUAL_FRICTION = 0.5

@@ -8,8 +8,6 @@ from typing import Any
 from .contacts import contact_parameters
 from .engine import Body
 
-__all__ = ["read_dynamics", "write_dynamics"]
-
 _FRICTIONS = ("lateral_friction", "rolling_friction", "spinning_friction")
 _CONTACT = (*_FRICTIONS, "restitution", "contact_stiffness", "contact_damping")
 

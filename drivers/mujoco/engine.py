@@ -11,8 +11,6 @@ from hal.errors import DriverMissing
 from hal.geometry import Transform
 from hal.kinematics.urdf import UrdfMimic
 
-__all__ = ["Body", "LinkContact", "load_mujoco", "wxyz"]
-
 
 def load_mujoco() -> Any:
     """Import and return the ``mujoco`` module.

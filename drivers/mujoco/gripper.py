@@ -7,8 +7,6 @@ from hal.drivers.scene.gripper import SimulatedGripper
 from .engine import Body
 from .world import MujocoWorld
 
-__all__ = ["MujocoGripper"]
-
 
 class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
     """The driver of the fingers of one robot in a :class:`~hal.drivers.mujoco.world.MujocoWorld`.

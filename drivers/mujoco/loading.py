@@ -36,8 +36,6 @@ from hal.specs import BodySpec, RobotSpec
 from .contacts import CARRIED, contact_parameters
 from .engine import Body, LinkContact, load_mujoco, wxyz
 
-__all__ = ["BodyPlan", "build", "plan_object", "plan_robot", "take_out"]
-
 Array = NDArray[np.float64]
 
 FINGER_INERTIA = 1.0

@@ -9,8 +9,6 @@ from hal.drivers.scene.robot import SimulatedRobot
 
 from .world import MujocoWorld
 
-__all__ = ["MujocoRobot"]
-
 Floats = Sequence[float]
 
 

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Sleep"]
-
 SLOWEST_START = 0.012
 """An object sleeps if it is slower for ten of MuJoCo's steps than one that starts with this acceleration, m/s2.
 

@@ -24,8 +24,6 @@ from .loading import BodyPlan, build, plan_object, plan_robot, take_out
 from .motors import Motors
 from .sleep import Sleep
 
-__all__ = ["MujocoWorld"]
-
 Array = NDArray[np.float64]
 
 LONGEST_STEP = 1.0 / 240.0

@@ -11,11 +11,6 @@ from hal.specs import RobotSpec
 from .engine import Body, PyBulletClient
 from .motors import position_gain
 
-__all__ = [
-    "AttachedObjects",
-    "MirroredArm",
-]
-
 
 class AttachedObjects:
     """Keeps objects that are attached to a link of an arm, such as a board in a gripper, at that link.

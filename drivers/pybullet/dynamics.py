@@ -12,18 +12,6 @@ from hal.geometry import compose
 
 from .engine import Body, PyBulletClient
 
-__all__ = [
-    "apply_force",
-    "bounding_box",
-    "cast_ray",
-    "deepest_overlap",
-    "distance",
-    "find_contacts",
-    "forget_contacts",
-    "read_dynamics",
-    "write_dynamics",
-]
-
 # Name here -> name of PyBullet's argument, place in getDynamicsInfo.
 _SCALARS = {
     "mass": ("mass", 0),

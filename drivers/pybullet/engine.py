@@ -19,15 +19,6 @@ from hal.drivers.scene.engine import SimulatedBody
 from hal.errors import DriverMissing
 from hal.geometry import Transform, compose, inverse
 
-__all__ = [
-    "Body",
-    "CapturedOutput",
-    "Gear",
-    "PyBulletClient",
-    "load_pybullet",
-    "silence_output",
-]
-
 GEAR_SHARE = 0.8
 """Share of the error between coupled joints that one physics step takes away."""
 GEAR_FORCE = 10.0

@@ -8,8 +8,6 @@ from .engine import Body
 from .motors import hold, position_gain
 from .world import PyBulletWorld
 
-__all__ = ["PyBulletGripper"]
-
 
 class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
     """The driver of the fingers of one robot in a :class:`~hal.drivers.pybullet.world.PyBulletWorld`.

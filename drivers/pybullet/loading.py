@@ -28,13 +28,6 @@ from hal.specs import BodySpec, RobotSpec
 from .engine import Body, Gear, PyBulletClient, silence_output
 from .motors import PassiveJoints
 
-__all__ = [
-    "fix_inertias",
-    "load_object",
-    "load_robot",
-    "loadable_urdf",
-]
-
 MARGIN, THIN = 0.001, 0.2
 """Margin that PyBullet adds around hulls, m; and what is taken off a thin hull at most, as a share of its thickness."""
 SLIVER = 1e-6

@@ -14,8 +14,6 @@ from hal.specs import RobotSpec
 
 from .engine import Body, PyBulletClient
 
-__all__ = ["JointTorques", "PassiveJoints", "hold", "position_gain"]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

@@ -11,8 +11,6 @@ from hal.drivers.scene.robot import SimulatedRobot
 from .motors import JointTorques, hold, position_gain
 from .world import PyBulletWorld
 
-__all__ = ["PyBulletRobot"]
-
 Floats = Sequence[float]
 
 FASTEST = 99.0

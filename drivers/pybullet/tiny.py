@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.drivers.scene.renderer import BACKGROUND, LUMINANCE, RenderedImages, Renderer
+from hal.drivers.scene.lighting import BACKGROUND
+from hal.drivers.scene.renderer import LUMINANCE, RenderedImages, Renderer
 from hal.drivers.scene.shapes import RenderScene, Visual
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import CameraSpec
 
 from .engine import PyBulletClient, silence_output
-
-__all__ = ["TinyRenderer"]
 
 _NEAR, _FAR = 0.05, 20.0
 """Range of its depth, m; depth is stored as a share between the two, so they set its resolution (3 um at 1 m)."""

@@ -20,8 +20,6 @@ from hal.views import Viewer
 
 from .world import PyBulletWorld
 
-__all__ = ["PyBulletViewer", "main"]
-
 _NICE = 10
 """Niceness of the window's process: everything else comes first."""
 _FRAME = 1 / 30

@@ -40,11 +40,6 @@ from .engine import Body, PyBulletClient
 from .loading import load_object, load_robot
 from .motors import PassiveJoints, hold
 
-__all__ = [
-    "PyBulletWorld",
-    "SnapshotLayout",
-]
-
 SOLVER: dict[str, Any] = {
     "deterministicOverlappingPairs": 1,
     "minimumSolverIslandSize": 1,

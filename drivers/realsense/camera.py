@@ -12,9 +12,10 @@ from dataclasses import fields
 from types import MappingProxyType
 from typing import Any
 
+from hal.arguments import freeze
 from hal.driver import CameraDriver, CameraInfo, CameraTally, RawFrame, StreamInfo
 from hal.errors import ConnectionLost, DeviceNotFound
-from hal.geometry import Pose, freeze
+from hal.geometry import Pose
 from hal.host.process import Child, SharedMemory, unpack_error
 from hal.host.ring import FrameRing
 from hal.specs import CameraSpec, to_json

@@ -33,18 +33,6 @@ from .mirror import LocalMirror, WorldMirror
 from .renderer import GLRenderer, Renderer
 from .shapes import RenderScene
 
-__all__ = [
-    "DirectSource",
-    "FrameSource",
-    "SimulatedCamera",
-    "SimulatedPictures",
-    "RenderWorker",
-    "SharedSource",
-    "check_pictures",
-    "choose_renderer",
-    "main",
-]
-
 _NICE = 5
 """Niceness of the process that draws: pictures come after the servo."""
 _IDLE = 0.001

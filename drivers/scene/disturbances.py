@@ -13,8 +13,6 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-__all__ = ["UNCHANGED", "Delay", "Disturbances", "Randomized"]
-
 T = TypeVar("T")
 
 

@@ -27,8 +27,6 @@ from .shapes import Visual
 from .urdf_files import absent_packages, checked_urdf, drawn_visuals, has_free_base, where_to_get
 from .values import body_spec, nearest
 
-__all__ = ["DrawnBody", "DrawnWorld"]
-
 Array = NDArray[np.float64]
 
 PLANE = (5.0, 5.0)

@@ -18,8 +18,6 @@ from hal.kinematics.urdf import UrdfModel
 from hal.specs import BodySpec, RobotSpec
 from hal.world import WorldDriver
 
-__all__ = ["IDENTITY", "AppliedForce", "RayFound", "SceneEngine", "SimulatedBody"]
-
 IDENTITY: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 

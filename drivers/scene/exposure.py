@@ -42,21 +42,6 @@ from hal.specs import CameraSpec, SensorSpec
 from .disturbances import UNCHANGED, Randomized
 from .renderer import RenderedImages, Renderer
 
-__all__ = [
-    "DepthNoise",
-    "DepthNoiseOptions",
-    "Exposure",
-    "LidarNoiseOptions",
-    "PictureNoise",
-    "PosedWorld",
-    "StereoNoiseOptions",
-    "camera_pose",
-    "check",
-    "check_view",
-    "depth_noise",
-    "noise_of",
-]
-
 Image = NDArray[np.float32]
 _SIDES = ("infrared", "infrared_right")
 

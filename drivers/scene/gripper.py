@@ -16,8 +16,6 @@ from .disturbances import Disturbances
 from .engine import SimulatedBody
 from .world import SimulatedWorld
 
-__all__ = ["FingerTravel", "SimulatedGripper"]
-
 AT_TARGET = 0.001
 """Tolerance of the target width, m."""
 SLOW = 0.002

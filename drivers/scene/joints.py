@@ -13,8 +13,6 @@ from hal.world import BodyJoint
 from .engine import SimulatedBody
 from .values import nearest, numbers
 
-__all__ = ["joints_to_place", "movable_joints", "reset_positions"]
-
 TOLERANCE = 1e-6
 """How far a position may be outside of its joint's range, rad or m."""
 

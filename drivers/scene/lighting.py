@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BACKGROUND", "Backdrop", "Light", "Look", "ShadowMap"]
-
 Array = NDArray[np.float64]
 
 BACKGROUND = (0.72, 0.76, 0.80)

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from .shapes import Mesh, joined, unit
 
-__all__ = ["MeshLibrary", "cache_folder", "coarsen_mesh", "parse", "simplify_mesh"]
-
 _FORMAT = 8
 """Version of the cache files; increase it whenever the records or the parsing change."""
 _BESIDE = {".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga"}

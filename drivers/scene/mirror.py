@@ -12,8 +12,6 @@ from hal.host.memory import SeriesBox
 from .drawn import DrawnWorld
 from .world import SimulatedWorld
 
-__all__ = ["LocalMirror", "MirrorWorld", "WorldMirror"]
-
 
 class MirrorWorld(Protocol):
     """A world that repeats edits and is posed by snapshots."""

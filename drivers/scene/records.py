@@ -12,18 +12,6 @@ from hal.specs import BodySpec, GripperSpec, RobotSpec
 
 from .values import listed
 
-__all__ = [
-    "JointDrives",
-    "SHAPES",
-    "check_names",
-    "followers_of",
-    "hulls_of",
-    "joint_drives",
-    "mimics_of",
-    "pad_links",
-    "required",
-]
-
 SHAPES = "box, sphere, cylinder, capsule, plane, mesh, urdf"
 """Shapes of objects, for messages."""
 PAD_FRICTION = (1.0, 0.1)

@@ -20,12 +20,10 @@ from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
-from .lighting import BACKGROUND, Backdrop, Light, Look, ShadowMap
+from .lighting import Backdrop, Light, Look, ShadowMap
 from .meshes import MeshLibrary
 from .shapes import DrawnPart, RenderScene, Visual, parts_of
 from .textures import load_texture
-
-__all__ = ["BACKGROUND", "LUMINANCE", "GLRenderer", "RenderedImages", "Renderer", "create_context"]
 
 Array = NDArray[np.float64]
 

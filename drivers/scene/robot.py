@@ -15,8 +15,6 @@ from hal.specs import RobotSpec
 from .disturbances import Disturbances
 from .world import SimulatedWorld
 
-__all__ = ["SimulatedRobot"]
-
 HOLD_TIME = 0.020
 """Time for which torques are held without new ones, s: the same as a Franka's."""
 FOLLOWING, PATIENCE = 0.1, 0.1

@@ -17,21 +17,6 @@ from hal.geometry import Pose
 from .lighting import Look
 from .textures import load_texture
 
-__all__ = [
-    "DrawnPart",
-    "Mesh",
-    "RenderScene",
-    "Visual",
-    "box",
-    "capsule",
-    "cylinder",
-    "joined",
-    "parts_of",
-    "plane",
-    "sphere",
-    "unit",
-]
-
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 

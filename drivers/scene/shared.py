@@ -20,8 +20,6 @@ from hal.host.process import unpack_error
 from hal.specs import RobotSpec, WorldSpec, to_json
 from hal.world import WorldDriver
 
-__all__ = ["Connection", "SharedWorld", "address_of", "check_scene", "join_world", "scene_of"]
-
 _LARGEST = 1 << 20
 """Largest message, bytes."""
 _PATIENCE = 10.0

@@ -9,8 +9,6 @@ from hal.errors import CommandError
 
 from .engine import SimulatedBody
 
-__all__ = ["check_state", "structure_of"]
-
 _PARTS = frozenset({"engine", "bodies", "drivers", "forces", "state"})
 
 

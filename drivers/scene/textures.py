@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["load_texture"]
-
 _SIDE = 128
 """Side of a texture that is made here, pixels."""
 

@@ -17,16 +17,6 @@ from hal.kinematics.mesh_files import PACKAGE, mesh_file, package_folder
 from hal.kinematics.urdf import UrdfLink, UrdfModel, UrdfVisual, parse_xml, read_urdf
 from hal.specs import BodySpec
 
-__all__ = [
-    "absent_packages",
-    "checked_urdf",
-    "drawn_visuals",
-    "has_free_base",
-    "massless",
-    "mesh_points",
-    "where_to_get",
-]
-
 HOLLOW, SLICES = 0.5, 10
 """Share of its hull that a finger's mesh must fill to collide as one hull, and how many slices it is cut into else."""
 

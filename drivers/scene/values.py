@@ -11,22 +11,6 @@ from hal.errors import CommandError
 from hal.geometry import Transform
 from hal.specs import BodySpec, from_json
 
-__all__ = [
-    "BOUNCE",
-    "DYNAMICS",
-    "body_spec",
-    "check_body",
-    "completed_dynamics",
-    "dynamics_values",
-    "like",
-    "listed",
-    "nearest",
-    "numbers",
-    "pose_json",
-    "same_value",
-    "transform",
-]
-
 SINKS = 1e-4
 """How deep a body sinks in by its weight with the stiffness that a message proposes, m."""
 BOUNCE = 0.01

@@ -34,8 +34,6 @@ from .values import (
     transform,
 )
 
-__all__ = ["SimulatedWorld"]
-
 OVERLAP = 0.005
 """Depth, m, from which on two arms that overlap at the start are refused, and objects that do are reported."""
 

@@ -20,8 +20,6 @@ from ..config.files import Problems, read_yaml, validate
 from ..config.schema import Pixels, Size, Strict, ValueProblem
 from ..errors import CommandError, DriverMissing
 
-__all__ = ["BUILT_IN", "Board", "board_page", "load_board", "opencv", "print_board"]
-
 BUILT_IN = "charuco_board"
 """The board that comes with the package: on a page of A4, and as an object of the simulated world."""
 PIXELS_PER_MM = 10

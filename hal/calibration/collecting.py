@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from ..robot import Robot
     from ..teleop import Teleop
 
-__all__ = ["Collector", "ManualDrive", "add_view", "collect_views", "plan_views", "wait_for_enter"]
-
 Array = NDArray[np.float64]
 Report = Callable[[str], None]
 

@@ -15,16 +15,6 @@ from ..images import undistort_pixels
 from ..types import Frame
 from .board import Board, opencv
 
-__all__ = [
-    "BoardDetection",
-    "CalibrationImage",
-    "Detector",
-    "NoView",
-    "edge_width",
-    "flat_pose",
-    "select_image",
-]
-
 Array = NDArray[np.float64]
 
 LEAST_CORNERS = 8

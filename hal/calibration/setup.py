@@ -25,18 +25,6 @@ from ..specs import Plan, RobotSpec
 if TYPE_CHECKING:
     from .solving import Eye
 
-__all__ = [
-    "PLACES",
-    "CalibrationSetup",
-    "RigFileOutput",
-    "back_up",
-    "choose_spec",
-    "find_setup",
-    "initial_guess",
-    "replace_camera_place",
-    "write_file",
-]
-
 PLACES = ("look_at", "pose", "attached")
 """Keys that give a camera's place in a rig's file; a camera has at most one of them."""
 

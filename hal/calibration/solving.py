@@ -33,17 +33,6 @@ except ImportError as error:
         "pip install 'robot-hal[calibration]'"
     ) from error
 
-__all__ = [
-    "LEAST_VIEWS",
-    "Calibration",
-    "CalibrationFailed",
-    "Eye",
-    "Residual",
-    "Uncertainty",
-    "View",
-    "solve",
-]
-
 Array = NDArray[np.float64]
 
 Eye = Literal["in-hand", "to-hand"]

@@ -9,19 +9,6 @@ from pydantic import AfterValidator, Field
 from ..randomization import LIGHTS
 from .schema import ENDS, Quantity, Several, Strict, ValueProblem, check_order
 
-__all__ = [
-    "EVERY",
-    "BackgroundVariation",
-    "BodyVariation",
-    "CameraVariation",
-    "DistractorsConfig",
-    "GripperVariation",
-    "LightVariation",
-    "LinkVariation",
-    "RandomizeConfig",
-    "RobotVariation",
-]
-
 EVERY = "*"
 """Stands for every object, robot or camera; what an entry of its own says precedes it."""
 

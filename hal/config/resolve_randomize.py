@@ -18,8 +18,6 @@ from .objects import load_objects
 from .randomize import EVERY, BodyVariation, LightVariation, RandomizeConfig
 from .schema import Strict, Unknown
 
-__all__ = ["resolve_randomize"]
-
 SECTION = "simulation.randomize"
 _NO_TEXTURE = "none"
 _AXES = 3

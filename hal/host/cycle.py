@@ -33,12 +33,6 @@ from .guards import guard_arms
 from .mirrors import make_mirrors
 from .records import AppRecord, GroupMemory, RobotMail, ServoRecord
 
-__all__ = [
-    "ArmUnit",
-    "Cycle",
-]
-
-
 TCP_APART, TCP_TURNED = 0.002, 0.02
 """Largest distance of a device's own tcp from the model's, m and rad."""
 _SHARE = 0.3

@@ -12,8 +12,6 @@ from ..servo.watchdog import SILENCE, is_alive
 from ..types import GripperOutcome
 from .records import AppRecord, GripperAct, GripperCommand, GripperMail
 
-__all__ = ["AT_WIDTH", "GripperUnit"]
-
 AT_WIDTH = 0.001
 """Largest distance from the target at which fingers at rest have reached it, m."""
 _SWITCH_ON = "check that it is on and connected"

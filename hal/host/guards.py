@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ..specs import CollisionSpec, GroupSpec, RobotSpec
     from .records import GroupMemory, RobotMail, ServoRecord
 
-__all__ = ["ArmElsewhere", "GuardedArm", "guard_arms"]
-
 Floats = Sequence[float]
 
 _OLD = 0.004

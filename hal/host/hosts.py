@@ -24,15 +24,6 @@ from .records import AppRecord, GroupMemory
 if TYPE_CHECKING:
     from ..specs import Plan
 
-__all__ = [
-    "GRIPPER_HZ",
-    "Host",
-    "LocalHost",
-    "RemoteHost",
-    "SteppedHost",
-    "make_groups",
-]
-
 GRIPPER_HZ = 100.0
 """Rate of a gripper that has a process of its own."""
 

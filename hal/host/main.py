@@ -24,15 +24,6 @@ from .process import Channel, SharedMemory, end_by_signal, pack_error
 from .records import AppRecord, GroupMemory
 from .scheduling import describe, is_realtime, prepare_process
 
-__all__ = [
-    "DevicePace",
-    "Pace",
-    "PeriodicPace",
-    "StepPace",
-    "SuspensionWatch",
-    "main",
-]
-
 _ASLEEP = 0.1
 """A computer that slept for longer than this, s, was suspended."""
 

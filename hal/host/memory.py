@@ -16,14 +16,6 @@ from zlib import crc32
 
 from ..types import Stamp
 
-__all__ = [
-    "History",
-    "Mailbox",
-    "Newest",
-    "SeriesBox",
-    "make_reader",
-]
-
 _HEADER = 8  # bytes: the announced number, in the machine's own order: this memory is never sent
 _SLOT = struct.Struct("<QQ")  # number, checksum
 _TRIES = 16

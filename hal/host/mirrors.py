@@ -8,8 +8,6 @@ from typing import Any
 from ..specs import GroupSpec
 from .records import GripperMail, GroupMemory, RobotMail
 
-__all__ = ["RobotMirror", "make_mirrors"]
-
 
 class RobotMirror:
     """Kinematic copy, in a simulated world, of an arm that another group moves."""

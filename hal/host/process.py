@@ -31,19 +31,6 @@ from ..errors import ConnectionLost, HalError, NotSupported, Problem
 from ..lock import APP_MARK
 from . import records
 
-__all__ = [
-    "Channel",
-    "ChannelClosed",
-    "Child",
-    "SharedMemory",
-    "child_main",
-    "end_by_signal",
-    "fill_standard_descriptors",
-    "pack_error",
-    "serve",
-    "unpack_error",
-]
-
 _BOOT = (
     "import sys, json, site; fds, path, target, library = json.loads(sys.argv[1]); "
     "sys.path += [p for p in path if p not in sys.path]; site.main(); "

@@ -28,24 +28,6 @@ if TYPE_CHECKING:
     from ..driver import GripperReading
     from ..specs import GroupSpec
 
-__all__ = [
-    "AppRecord",
-    "FAULT_FORMAT",
-    "GripperAct",
-    "GripperCommand",
-    "GripperMail",
-    "GripperRecord",
-    "GroupMemory",
-    "HostRecord",
-    "LAYOUT",
-    "RobotMail",
-    "ServoRecord",
-    "StateLayout",
-    "read_fault",
-    "make_fault",
-    "fault_values",
-]
-
 _TEXTS = (48, 160, 240)  # bytes for a fault's code, cause and remedy
 FAULT_FORMAT = "?" + "".join(f"{size}s" for size in _TEXTS)
 """Format of a fault for :mod:`struct`: a mark that there is one, then three texts of fixed length."""

@@ -23,8 +23,6 @@ from ..geometry import Pose
 from ..specs import CameraSpec
 from ..types import STREAMS
 
-__all__ = ["ArrayRing", "FrameRing", "Images", "frame_rings", "frame_rings_size"]
-
 Images = Mapping[str, NDArray[Any]]
 """The pictures of one capture, by the names of their streams."""
 Key = TypeVar("Key", bound=Hashable)

@@ -13,8 +13,6 @@ import sys
 
 from ..preflight import may_lock_memory
 
-__all__ = ["describe", "is_realtime", "prepare_process", "yield_to_others"]
-
 PRIORITY = 50
 """Priority of a host among SCHED_FIFO processes, 1 to 99."""
 SLICE = 1e-4

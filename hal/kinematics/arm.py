@@ -25,8 +25,6 @@ from .urdf import parse_xml
 if TYPE_CHECKING:
     from ..specs import KinematicsSpec
 
-__all__ = ["Frame", "Kinematics", "Pose7", "add_tcp", "bounded_urdf", "reduced_model"]
-
 Array = NDArray[np.float64]
 Frame = Literal["base", "tcp", "space"]
 """In which frame a Jacobian is: see :meth:`Kinematics.jacobian`."""

@@ -26,8 +26,6 @@ from .urdf import UrdfJoint, UrdfModel, UrdfVisual, read_urdf
 if TYPE_CHECKING:
     from ..specs import CollisionSpec, KinematicsSpec, RobotSpec
 
-__all__ = ["CollisionModel", "PairBounds", "PairDistance"]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

@@ -16,8 +16,6 @@ from .collision_model import CollisionModel, PairBounds, PairDistance
 if TYPE_CHECKING:
     from ..specs import CollisionSpec, RobotSpec
 
-__all__ = ["Collisions", "PairDistance", "in_one_place"]
-
 Array = NDArray[np.float64]
 
 _STEP = 1e-3

@@ -17,8 +17,6 @@ from ..geometry import Pose
 from .mesh_files import PACKAGE, mesh_file
 from .urdf import UrdfModel, parse_xml
 
-__all__ = ["MountedTool", "compose_urdf", "divide_urdf"]
-
 PREFIX = "tool_"
 """Put before each name of a tool that the arm has too."""
 

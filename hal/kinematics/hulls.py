@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from .mesh_files import check_mesh
 
-__all__ = ["FORMATS", "Hull", "Solid", "convex_hull", "mesh_hulls", "mesh_parts", "principal_axes", "uniform_solid"]
-
 Array = NDArray[np.float64]
 
 FORMATS = (".obj", ".stl", ".dae")

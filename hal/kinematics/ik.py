@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ..errors import Unreachable
 from ..geometry import Pose
 
-__all__ = ["IkModel", "solve"]
-
 Array = NDArray[np.float64]
 
 ITERATIONS = 80

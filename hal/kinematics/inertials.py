@@ -17,8 +17,6 @@ from ..geometry import rpy_to_matrix
 from .mesh_files import mesh_file
 from .urdf import UrdfModel, parse_xml, read_urdf
 
-__all__ = ["find_wrong_inertials"]
-
 Array = NDArray[np.float64]
 
 INEXACT = 0.2

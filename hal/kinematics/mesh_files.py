@@ -19,8 +19,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PACKAGE", "check_mesh", "hull_points", "is_installed", "mesh_file", "mesh_near", "package_folder"]
-
 PACKAGE = "package://"
 """Begins the name of a file in an installed package."""
 _SCHEMES = (PACKAGE, "model://", "file://")

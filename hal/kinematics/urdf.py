@@ -19,8 +19,6 @@ from xml.parsers import expat
 from ..geometry import Pose, apply_rotation, rotate
 from .mesh_files import check_mesh, is_installed, mesh_file
 
-__all__ = ["UrdfJoint", "UrdfLink", "UrdfMimic", "UrdfModel", "UrdfVisual", "parse_xml", "read_urdf"]
-
 TURNING = ("revolute", "continuous")
 """Joints that turn about an axis, rad."""
 MOVABLE = (*TURNING, "prismatic")

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from ..robot import Robot
     from .policy import PolicyAnswer
 
-__all__ = ["RemotePolicy"]
-
 Array = NDArray[np.float64]
 
 _LATENCIES = 100

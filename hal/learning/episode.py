@@ -21,12 +21,6 @@ if TYPE_CHECKING:
     from ..robot import Robot
     from ..world import World
 
-__all__ = [
-    "sample_poses",
-    "reset_scene",
-    "stands_in_world",
-]
-
 Array = NDArray[np.float64]
 
 _TRIES = 100

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from ..robot import Robot
 
-__all__ = ["EpisodeRecipe", "EpisodeResult", "EpisodeWorker", "check_recipe", "clean_part", "main"]
-
 _MISTAKES = (ConfigError, DeviceNotFound, DriverMissing, NotSupported)
 """Errors that no episode can be about: the skill, or the installation, is wrong."""
 

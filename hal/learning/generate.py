@@ -21,12 +21,10 @@ from typing import Any, NamedTuple
 from ..errors import CommandError, ConnectionLost, HalError
 from ..host.process import Child
 from ..recording.dataset import Episode
-from ..recording.layout import DatasetLayout, require_libraries
-from ..recording.merging import finish_replacement, merge
+from ..recording.layout import DatasetLayout, finish_replacement, require_libraries
+from ..recording.merging import merge
 from .episode_worker import EpisodeRecipe, EpisodeResult, check_recipe, clean_part
 from .uploads import UploadedEpisodes
-
-__all__ = ["EpisodeFailed", "GenerateProgress", "LocalWorker", "WorkerHandle", "generate", "parts_folder"]
 
 _DEATHS = 3
 """Number of workers that may die while they make the same episode."""

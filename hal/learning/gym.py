@@ -56,8 +56,6 @@ except ImportError as error:
 if TYPE_CHECKING:
     from ..servo.controllers import Controller
 
-__all__ = ["EnvSettings", "RigEnv"]
-
 Result = tuple[ObservationDict, dict[str, Any]]
 
 simulated_only = False

@@ -31,17 +31,6 @@ if TYPE_CHECKING:
     from ..servo.controllers import Controller
     from .takeover import Takeover
 
-__all__ = [
-    "PolicyAnswer",
-    "PolicyOutcome",
-    "Policy",
-    "PolicyRunner",
-    "check_targets",
-    "is_made_with_rig",
-    "load_object",
-    "load_policy",
-]
-
 ArmAnswer: TypeAlias = "Command | tuple[Command | None, float | None] | None"
 """A command; or a command and a grip from 0 (open) to 1 (closed), either of which may be None. None continues the
 chunk that was sent before."""

@@ -26,14 +26,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from ..robot import Robot
 
-__all__ = [
-    "ActionConfig",
-    "GripperAction",
-    "PolicyConfig",
-    "Source",
-    "load_policy_config",
-]
-
 Array = NDArray[np.float64]
 T = TypeVar("T")
 

@@ -16,8 +16,6 @@ from ..host.process import pack_error, unpack_error
 from .episode_worker import EpisodeResult, EpisodeWorker
 from .generate import LONGEST, WorkerHandle
 
-__all__ = ["RayCluster", "RayWorker"]
-
 _STORE = 80_000_000
 """Memory for Ray's objects on a cluster that is started here, bytes: close to Ray's least. Results are small."""
 _START = 120.0

@@ -22,8 +22,6 @@ import numpy as np
 
 from ..errors import DriverMissing, PolicyError
 
-__all__ = ["PolicyClient", "PolicyServer", "pack", "unpack"]
-
 T = TypeVar("T")
 Message = dict[str, Any]
 

@@ -24,14 +24,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from ..robot import Robot
 
-__all__ = [
-    "Deviation",
-    "TrajectoryPlayer",
-    "RecordedTrajectory",
-    "list_recorded_arms",
-    "list_other_arms",
-]
-
 Array = NDArray[np.float64]
 
 _ROUNDED = 1e-5

@@ -17,18 +17,6 @@ from ..robot import Robot
 from ..specs import CameraSpec
 from ..types import STREAMS
 
-__all__ = [
-    "ActionKind",
-    "ObservationDict",
-    "action_names",
-    "action_space",
-    "entry_key",
-    "list_streams",
-    "numbers_and_pictures",
-    "observation_space",
-    "pose_array",
-]
-
 ActionKind = Literal["joint", "tcp_delta", "twist", "velocity", "torque"]
 """``joint``: positions (n,), rad; more than 0.1 rad from the set-point they are clipped, and ``info["clipped"]`` is
 True. ``tcp_delta``: translation (m) and rotation vector (rad) of the tcp's goal in this step, along the base's axes.

@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from ..teleop import Teleop
     from ..types import PadState
 
-__all__ = ["Takeover"]
-
 _PRESSED = 0.05
 """Share of a trigger's travel from which it counts as pressed."""
 

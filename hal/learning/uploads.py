@@ -27,8 +27,6 @@ from typing import Any, NamedTuple
 from ..errors import CommandError, ConnectionLost, DriverMissing
 from ..recording.layout import GROUP
 
-__all__ = ["EpisodeUploader", "UploadedEpisodes", "is_address"]
-
 _RECIPE = "recipe.json"
 _NAME = re.compile(r"(?P<part>[0-9a-f]+)/\d{6}\.(?P<number>\d+)\.(?P<mark>none|false|true)\.zip")
 """Name of an uploaded file: its worker's part, its place there, the number of its episode, and the mark of that."""

@@ -39,8 +39,6 @@ from ..host.process import START_TIMEOUT, Channel, Child, SharedMemory, pack_err
 from . import gym
 from .spaces import ObservationDict, entry_key
 
-__all__ = ["RigVectorEnv", "make_vec"]
-
 _LONGEST = 3600.0
 """Longest time of a call, s: functions of the user run in it."""
 _CLOSE_TIMEOUT = 10.0

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from ..host.records import ServoRecord
     from ..robot import Robot
 
-__all__ = ["CHECK_HZ", "ArmMotion", "ArmMotionResult"]
-
 CHECK_HZ = 50.0
 """Rate at which a motion is checked while it is waited for, Hz."""
 _FAULTY = (RobotStatus.FAULT, RobotStatus.LOST)

@@ -15,8 +15,6 @@ from math import ceil, hypot
 
 from ..geometry import apply_rotation, difference
 
-__all__ = ["METRES_PER_RADIAN", "REVERSAL", "STRAIGHT_ON", "Corner", "Segment", "TcpLine", "tcp_lines"]
-
 Floats = Sequence[float]
 
 METRES_PER_RADIAN = 0.2

@@ -23,8 +23,6 @@ from ..servo.path import JointPath
 from ..specs import WorkspaceSpec
 from .lines import REVERSAL, STRAIGHT_ON, TcpLine, tcp_lines
 
-__all__ = ["MotionCheck", "MotionPlan", "PathPlanner"]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

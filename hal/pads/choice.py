@@ -12,8 +12,6 @@ from ..errors import DeviceNotFound, DriverMissing, NotSupported
 from ..registry import PadInput
 from ..specs import PadSpec
 
-__all__ = ["TOUR", "Chosen", "check_wanted", "choose_pad", "pad_choices", "play_tour"]
-
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
 _AUTO, _DEMO, _NONE = "auto", "demo", "none"

@@ -9,25 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = [
-    "ABS",
-    "ABS_NAME",
-    "BUS_BLUETOOTH",
-    "BUS_USB",
-    "EV_ABS",
-    "EV_FF",
-    "EV_KEY",
-    "EV_MSC",
-    "EV_REL",
-    "EV_SYN",
-    "FF_RUMBLE",
-    "KEY",
-    "KEY_NAME",
-    "REL",
-    "SYN_DROPPED",
-    "SYN_REPORT",
-]
-
 EV_SYN, EV_KEY, EV_REL, EV_ABS, EV_MSC, EV_FF = 0x00, 0x01, 0x02, 0x03, 0x04, 0x15
 SYN_REPORT, SYN_DROPPED = 0, 3
 FF_RUMBLE = 0x50

@@ -8,9 +8,6 @@ from typing import Any, NamedTuple
 
 from ..config.data_files import find_data
 
-__all__ = ["KeyboardTable", "keyboard_table"]
-
-
 _ASCII = {"↑": "Up", "↓": "Down", "←": "Left", "→": "Right"}
 """Label of an arrow key -> its name for messages."""
 

@@ -12,8 +12,6 @@ from .codes import ABS, EV_ABS, EV_KEY, EV_REL, KEY, REL
 if TYPE_CHECKING:
     from .model import PadModel
 
-__all__ = ["REL_SILENCE", "AxisRange", "PadMapper"]
-
 REL_SILENCE = 0.1
 """Time without an event after which a ``REL_`` axis is at rest, s: no event is sent when it is released. A pushed cap
 reports at the rate of USB, every 8 or 16 ms, so late reports do not interrupt a motion. The time is shorter than the

@@ -16,17 +16,6 @@ from ..config.schema import Strict, ValueProblem
 from ..types import AXES, BUTTONS
 from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
 
-__all__ = [
-    "Identity",
-    "MatchRule",
-    "PadModel",
-    "choose_model",
-    "guess_model",
-    "guess_warning",
-    "pad_model",
-    "check_record",
-]
-
 PRINTED: Mapping[str, Mapping[str, str]] = {
     "playstation": {
         "south": "Cross",

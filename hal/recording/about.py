@@ -19,8 +19,6 @@ from pydantic import Field, FiniteFloat
 from .layout import DatasetLayout, file_version, read_json
 from .validation import CameraName, Feature, Model, dataset_errors
 
-__all__ = ["read_about", "split_about"]
-
 _COMMON = (
     "cameras",
     "clock",

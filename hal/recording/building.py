@@ -30,8 +30,6 @@ from .layout import GROUP, VIDEO_MB, DatasetLayout, EpisodePlace, video_key, vid
 from .validation import dataset_errors
 from .videos import VideoPart, can_be_joined, join_videos
 
-__all__ = ["DatasetBuilder", "EpisodeLabel", "EpisodeSource", "link_file"]
-
 _THREADS = 4
 _ROWS = 1000
 """Rows of a group of rows, at least: a group takes some kB of its own, and is read whole."""

@@ -35,8 +35,6 @@ from .layout import (
 )
 from .validation import dataset_errors
 
-__all__ = ["EpisodeChange", "change_episodes", "existing_episodes", "open_to_change", "mark_episodes", "refuse_foreign"]
-
 
 class EpisodeChange(NamedTuple):
     """What changes in a finished episode."""

@@ -33,16 +33,6 @@ from .layout import (
 )
 from .validation import dataset_errors
 
-__all__ = [
-    "check_compatible",
-    "check_dataset",
-    "check_index",
-    "check_rows",
-    "format_differences",
-    "known_columns",
-]
-
-
 _CLOSE = 1e-4
 """Difference of a time stamp that LeRobot tolerates, s."""
 _CLOSE_STATS = 1e-6

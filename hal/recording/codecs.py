@@ -15,22 +15,6 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "DepthFile",
-    "DepthReader",
-    "PictureStats",
-    "Stats",
-    "copy_records",
-    "column_stats",
-    "merge_stacked",
-    "merge_stats",
-    "ids_to_units",
-    "stats_as_lists",
-    "to_units",
-    "depth_unit_for",
-    "exchange_flags",
-]
-
 # Depth files: zstd over the differences of neighbouring pixels, low and high bytes apart.
 #
 # A file is one line of JSON (size, unit), then a record per row of the episode: length, checksum, data. An empty record

@@ -30,8 +30,6 @@ from .merging import extract, merge, open_dataset
 from .validation import checked_name, dataset_errors
 from .videos import key_frames
 
-__all__ = ["KeptRows", "find_motion", "shares", "split", "trim"]
-
 
 def shares(count: int, parts: Mapping[str, float], seed: int = 0) -> dict[str, list[int]]:
     """Return the episodes of each part of a random split, the same for the same seed.

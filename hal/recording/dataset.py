@@ -39,9 +39,6 @@ from .layout import (
 from .validation import dataset_errors
 from .videos import count_frames, read_picture, read_video
 
-__all__ = ["CameraDepth", "Dataset", "Episode", "EpisodeDepth", "KeptRows"]
-
-
 P = TypeVar("P", bound=NDArray[Any])
 
 

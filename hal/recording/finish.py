@@ -48,23 +48,6 @@ from .metadata import ClockPace
 from .validation import dataset_errors
 from .videos import picture_stats, remux
 
-__all__ = [
-    "CLOSING",
-    "entries_table",
-    "entry_row",
-    "finalise",
-    "finished_episode",
-    "move_files",
-    "recover_all",
-    "new_info",
-    "write_mark",
-    "rows_table",
-    "stats_of",
-    "stats_row",
-    "tasks_table",
-    "write_table",
-]
-
 
 def new_info(features: Mapping[str, Any], fps: int, robot_type: str) -> dict[str, Any]:
     """Return ``meta/info.json`` of a dataset without episodes."""

@@ -17,8 +17,6 @@ from .index import read_tasks, validated_info
 from .layout import CHUNK, GRID, MORE_STREAMS, DatasetLayout, current_key, read_json, video_key
 from .validation import dataset_errors
 
-__all__ = ["ForeignDataset", "is_foreign", "read_foreign"]
-
 _PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _PATHS = {"data_path": f"data/{_PLACE}.parquet", "video_path": f"videos/{{video_key}}/{_PLACE}.mp4"}
 _NUMBERS = ("float32", "float64", "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")

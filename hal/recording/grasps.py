@@ -19,8 +19,6 @@ from .changing import EpisodeChange, change_episodes
 from .dataset import Episode, lacks_grip_force
 from .layout import ACTION, SETPOINT, SOURCE, SOURCES, STATE, DatasetLayout, current_key
 
-__all__ = ["Closing", "find_closings", "repair_grasps"]
-
 _ARRIVED = 0.001
 """Difference from a target width at which fingers still count as arrived, m."""
 _STILL = 0.0005

@@ -16,21 +16,6 @@ from .codecs import Stats, merge_stacked, merge_stats
 from .layout import CHUNK, DatasetLayout, EpisodePlace, read_json, video_names
 from .validation import CameraName, Feature, Model, dataset_errors
 
-__all__ = [
-    "check_next_episode",
-    "merged_stats",
-    "next_place",
-    "read_entries",
-    "read_index",
-    "read_stats",
-    "read_table",
-    "read_tasks",
-    "repair_command",
-    "stats_parts",
-    "stray_files",
-    "validated_info",
-]
-
 _TASK = "__index_level_0__"
 """LeRobot 0.4's name of the column of texts in ``meta/tasks.parquet``; 0.6's is ``task``, and it reads both."""
 

@@ -20,47 +20,6 @@ from typing import Any, NamedTuple
 from ..errors import CommandError, DriverMissing
 from ..types import STREAMS
 
-__all__ = [
-    "ACTION",
-    "AFTERWARDS",
-    "BOOKKEEPING",
-    "ENVIRONMENT",
-    "CameraSetup",
-    "Column",
-    "GRID",
-    "MOVES",
-    "DatasetLayout",
-    "EpisodePlace",
-    "GRIP_FORCE",
-    "GROUP",
-    "MORE_STREAMS",
-    "OBJECTS",
-    "PAD",
-    "SETPOINT",
-    "SOURCE",
-    "SOURCES",
-    "STATE",
-    "SUCCESS",
-    "TAU_EXT",
-    "TIMES",
-    "VERSION",
-    "VIDEO_MB",
-    "building_folder",
-    "current_key",
-    "features_of",
-    "file_version",
-    "finish_replacement",
-    "lock_dataset",
-    "put_in_place",
-    "read_json",
-    "require_libraries",
-    "sync_to_disk",
-    "WRENCH_EXT",
-    "video_key",
-    "video_names",
-    "write_json",
-]
-
 VERSION = "v3.0"
 """Version of LeRobot's format."""
 STATE = "observation.state"

@@ -29,18 +29,6 @@ from .layout import MORE_STREAMS, CameraSetup, read_json, sync_to_disk, write_js
 from .validation import checked_name
 from .videos import VideoEncoder, VideoFile, as_rgb, count_frames, truncate_to_last_fragment
 
-__all__ = [
-    "ABOUT",
-    "Images",
-    "LiveContent",
-    "LiveFolder",
-    "RESERVE",
-    "ROWS",
-    "RowQueue",
-    "RowSlot",
-    "read_live",
-]
-
 # The queue.
 
 _STATUS = "dH2000s"  # free space in bytes, length of the trouble's text, the text

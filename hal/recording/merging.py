@@ -31,16 +31,6 @@ from .layout import (
     video_names,
 )
 
-__all__ = [
-    "EpisodeLabel",
-    "delete_episodes",
-    "extract",
-    "finish_replacement",
-    "merge",
-    "pack",
-    "set_task",
-]
-
 _LOG = logging.getLogger("hal.recording")
 
 

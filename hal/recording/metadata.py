@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from .sampling import CameraBuffer
 
-__all__ = ["SLOW_PACE", "ClockPace", "simulated_pace", "rig_metadata", "start_metadata", "caller_metadata"]
-
 _ENOUGH = 2.0
 """Length of an episode before its pace is reported, s."""
 _CHANGED = 0.02

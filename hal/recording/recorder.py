@@ -32,15 +32,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from .sampling import RowSnapshot
 
-__all__ = [
-    "EpisodeRecorder",
-    "DroppedRows",
-    "Recorder",
-    "RecorderStatus",
-    "BackgroundSave",
-    "check_rate",
-]
-
 _LOG = logging.getLogger("hal.recording")
 _GIVE_UP = 1.0
 """Time without a single row after which an episode records no more, s."""

@@ -34,8 +34,6 @@ from .layout import (
 )
 from .validation import dataset_errors
 
-__all__ = ["recover", "repair"]
-
 
 def recover(out: str | Path) -> list[str]:
     """Finish every interrupted episode of the dataset in the folder ``out``.

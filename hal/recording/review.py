@@ -21,22 +21,6 @@ from .exporters.content import ArmColumns, EpisodeContent, PictureStream
 from .layout import ACTION, SETPOINT, STATE
 from .metadata import simulated_pace
 
-__all__ = [
-    "BLACK",
-    "SheetCanvas",
-    "Colour",
-    "EpisodeSummary",
-    "GREY",
-    "LIGHT",
-    "ColumnSpread",
-    "DatasetSummary",
-    "SourceTiming",
-    "summary_as_json",
-    "draw_sheet",
-    "summarize",
-    "ticks",
-]
-
 # Drawing.
 
 Colour = tuple[int, int, int]

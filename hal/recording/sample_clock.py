@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from ..clock import Clock
     from .sampling import RowSnapshot
 
-__all__ = ["LAG", "LockStepSampleClock", "RealTimeSampleClock", "SampleClock"]
-
 LAG = 0.1
 """Delay after its due time at which a row is made in real time, s: by then the picture of that time has arrived."""
 _LATE = 1.0

@@ -44,14 +44,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from ..robot import Robot
 
-__all__ = [
-    "CameraBuffer",
-    "RowSnapshot",
-    "RowSampler",
-    "movable_objects",
-    "select_devices",
-]
-
 _KEEP = 0.5
 """Span of pictures that are kept for rows that are made late, s."""
 _SILENT = 1.0

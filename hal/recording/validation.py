@@ -12,8 +12,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from ..errors import DatasetError, HalError
 
-__all__ = ["CameraName", "Feature", "Model", "checked_name", "dataset_errors"]
-
 _SIDE = 16384
 """Pixels; no picture is larger."""
 _DISK_REFUSES = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}

@@ -25,23 +25,6 @@ from .layout import file_version
 if TYPE_CHECKING:
     from av.container import InputContainer
 
-__all__ = [
-    "VideoEncoder",
-    "VideoFile",
-    "VideoPart",
-    "as_rgb",
-    "can_be_joined",
-    "choose_encoder",
-    "count_frames",
-    "truncate_to_last_fragment",
-    "join_videos",
-    "key_frames",
-    "picture_stats",
-    "read_picture",
-    "read_video",
-    "remux",
-]
-
 Picture = NDArray[np.uint8]
 
 _LIVE = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"}

@@ -23,8 +23,6 @@ from .layout import CameraSetup, DatasetLayout, lock_dataset, require_libraries,
 from .live import RESERVE, LiveFolder, RowQueue
 from .videos import choose_encoder
 
-__all__ = ["free_bytes", "main"]
-
 _NICE = 2
 """Niceness, between the servo's and the renderer's: a late picture is late, a row that is not written is lost."""
 _IDLE_TIMEOUT = 0.2

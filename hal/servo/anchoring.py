@@ -23,8 +23,6 @@ from ..types import Trip
 from .smoothing import JointSmoother, stop_peak
 from .watchdog import SILENCE
 
-__all__ = ["LATEST", "MISMATCHES", "NOISIEST", "Anchoring"]
-
 Floats = Sequence[float]
 LATEST = 5
 """Largest age of a report, cycles."""

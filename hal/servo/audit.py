@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from ..driver import Setpoint
 from ..specs import LimitsSpec
 
-__all__ = ["SetpointAudit"]
-
 _HISTORY = 3
 """Differences up to the third need three samples before the one that they belong to."""
 _TORQUE_RATE = 1000.0

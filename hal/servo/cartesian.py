@@ -16,8 +16,6 @@ from .envelope import Envelope
 from .joint import ServoMotion
 from .smoothing import JointSmoother, speed_for
 
-__all__ = ["PoseMotion", "TwistMotion"]
-
 Floats = Sequence[float]
 
 _LEAD = (0.05, 0.2)

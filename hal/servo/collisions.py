@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from ..kinematics.collision_model import CollisionModel, PairBounds
 from .smoothing import JointSmoother, speed_for, stop_at, stop_displacement, stop_distance, stop_peak, stop_pieces
 
-__all__ = ["CollisionGuard", "MeasuredGuard", "Neighbour", "Stop"]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

@@ -26,8 +26,6 @@ from .envelope import Envelope
 from .torque import TorqueMotion
 from .torque_bounds import RATE
 
-__all__ = ["LEAD", "Compliance", "followable_jerk"]
-
 Floats = Sequence[float]
 
 LEAD = (0.05, 0.2)

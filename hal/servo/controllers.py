@@ -39,18 +39,6 @@ if TYPE_CHECKING:
     from ..kinematics.arm import Kinematics
     from ..specs import RobotSpec
 
-__all__ = [
-    "Controller",
-    "ControllerLaw",
-    "JointImpedance",
-    "OperationalSpace",
-    "Position",
-    "controller_data",
-    "controller_of",
-    "resolve",
-    "replace_gains",
-]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 Gain: TypeAlias = float | tuple[float, ...]

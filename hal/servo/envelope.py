@@ -20,11 +20,6 @@ from .smoothing import Guard, JointSmoother, speed_for, stop_displacement, stop_
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "Envelope",
-    "TcpReference",
-]
-
 Floats = Sequence[float]
 
 _SAME = 2e-3

@@ -17,14 +17,6 @@ from ..types import Limited
 from .envelope import Envelope
 from .smoothing import JointSmoother, speed_for
 
-__all__ = [
-    "ChunkMotion",
-    "JointTargetMotion",
-    "JointVelocityMotion",
-    "ServoMotion",
-    "slope",
-]
-
 Floats = Sequence[float]
 
 

@@ -29,8 +29,6 @@ from ..kinematics.arm import Kinematics
 from ..specs import LimitsSpec
 from .smoothing import stop_distance
 
-__all__ = ["JointPath", "Leg", "Zone", "ZonePlanner", "zones_of"]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

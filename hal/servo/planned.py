@@ -22,8 +22,6 @@ from .joint import ServoMotion
 from .path import JointPath, Leg, Zone, ZonePlanner, zones_of
 from .smoothing import JointSmoother, stop_displacement
 
-__all__ = ["PathMotion", "PlannedMotion"]
-
 Floats = Sequence[float]
 
 START_MOVED = 0.02

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from ..types import ControlMode, Limited, RobotStatus, Trip
 
-__all__ = ["ServoReport"]
-
 Floats = Sequence[float]
 
 

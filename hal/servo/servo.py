@@ -33,8 +33,6 @@ from .smoothing import JointSmoother
 from .torque import BRAKE_LIMIT, MassMatrix, TorqueMotion
 from .watchdog import SILENCE, WITHHELD, WITHHELD_FAULT, Watchdog, is_alive, is_timely
 
-__all__ = ["Servo"]
-
 Floats = Sequence[float]
 
 

@@ -28,19 +28,6 @@ from ruckig import (
 
 from ..specs import LimitsSpec
 
-__all__ = [
-    "Guard",
-    "JointSmoother",
-    "speed_for",
-    "stop_at",
-    "stop_displacement",
-    "stop_distance",
-    "stop_peak",
-    "stop_phases",
-    "stop_pieces",
-    "stop_step",
-]
-
 
 def stop_distance(v: float, A: float, J: float) -> float:
     """Return the distance (rad) of a stop from speed ``v >= 0`` and no acceleration.

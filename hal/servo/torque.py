@@ -26,12 +26,6 @@ from .watchdog import SILENCE
 if TYPE_CHECKING:
     from .controllers import ControllerLaw
 
-__all__ = [
-    "BRAKE_LIMIT",
-    "MassMatrix",
-    "TorqueMotion",
-]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

@@ -25,15 +25,6 @@ from ..specs import LimitsSpec
 from ..types import Limited
 from .envelope import UNLIMITED, Envelope
 
-__all__ = [
-    "RATE",
-    "ArmInMotion",
-    "Inertia",
-    "TcpInMotion",
-    "TorqueBounds",
-    "make_solver",
-]
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 

@@ -9,8 +9,6 @@ from ..commands import CommandRecord, DeadmanRecord, Inbox, Session
 from ..errors import Fault
 from ..types import Trip
 
-__all__ = ["PAD_SILENCE", "SILENCE", "WITHHELD", "WITHHELD_FAULT", "Watchdog", "is_alive", "is_timely"]
-
 SILENCE = 0.150
 """Longest time from the last sign of life of the dead-man's pad, of the app or of the device to the stop, s."""
 

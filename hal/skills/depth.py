@@ -28,17 +28,6 @@ if TYPE_CHECKING:
     from ..robot import Robot
     from ..types import Frame
 
-__all__ = [
-    "find_by_depth",
-    "look_at",
-    "locate_by_depth",
-    "read_frames",
-    "collect_points",
-    "find_table",
-    "largest_cluster",
-    "Plane",
-]
-
 Array = NDArray[np.float64]
 
 _REACH = (0.2, 0.85)

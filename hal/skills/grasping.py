@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from ..robot import Robot
 
-__all__ = ["gentle_grasp", "grasp"]
-
 Array = NDArray[np.float64]
 
 PHASES = ("open", "approach", "descend", "close", "lift", "hold")

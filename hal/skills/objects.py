@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from ..robot import Robot
 
-__all__ = ["LocatedObject", "grasp_pose", "locate_by_truth", "object_from_points"]
-
 Array = NDArray[np.float64]
 
 _TURN = math.radians(1.0)

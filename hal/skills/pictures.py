@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..robot import Robot
     from ..types import Frame
 
-__all__ = ["draw_plan", "save_plan"]
-
 Array = NDArray[np.float64]
 
 _POINT, _BOX, _WAY, _FINGERS = (255, 220, 60), (60, 220, 90), (250, 70, 60), (70, 140, 255)

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from ..robot import Robot
 
-__all__ = ["push", "push_path", "push_to"]
-
 Array = NDArray[np.float64]
 
 PHASES = ("close", "approach", "descend", "push", "back_off", "lift")

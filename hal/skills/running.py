@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from ..gripper import Gripper, GripperMotion, GripperResult
     from ..robot import Robot
 
-__all__ = ["Reason", "SkillOptions", "SkillPhase", "SkillProgress", "SkillResult", "SkillRun", "flip_pose", "lift_pose"]
-
 Array = NDArray[np.float64]
 
 Reason = Literal[

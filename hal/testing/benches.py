@@ -21,24 +21,6 @@ from ..driver import CameraDriver, GamepadDriver, GripperDriver, RobotDriver
 from ..errors import ConnectionLost, HalError, StaleStateError
 from ..specs import CameraSpec, Floats, GripperSpec, KinematicsSpec, LimitsSpec, PadSpec, RobotSpec, ViewSpec
 
-__all__ = [
-    "Bench",
-    "CameraBench",
-    "Contract",
-    "GripperBench",
-    "PadBench",
-    "RobotBench",
-    "bench_of",
-    "camera_spec",
-    "gripper_spec",
-    "needs",
-    "pad_spec",
-    "robot_spec",
-    "run_in_thread",
-    "wait_lost",
-    "wait_restored",
-]
-
 _HANGS = 15.0
 """s after which a call counts as hanging."""
 

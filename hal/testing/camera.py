@@ -15,8 +15,6 @@ from ..errors import CommandError, ConnectionLost, HalError, NotSupported, Stale
 from ..types import STREAMS, Frame
 from .benches import CameraBench, Contract, needs, run_in_thread, wait_lost, wait_restored
 
-__all__ = ["CameraContract"]
-
 _FIRST = 10.0
 """s for the first frame after ``open``, on a busy machine."""
 _WAIT = 0.2

@@ -13,8 +13,6 @@ from ..gamepad import Gamepad
 from ..types import AXES, BUTTONS, ONE_SIDED
 from .benches import Contract, PadBench, needs, run_in_thread
 
-__all__ = ["GamepadContract"]
-
 _TURNS = 3000
 """Polls within which a change must show."""
 _SLOW = 0.005

@@ -16,8 +16,6 @@ from ..types import GripperOutcome, GripperState
 from .benches import Contract, GripperBench, needs, run_in_thread, wait_lost, wait_restored
 from .hosting import HostedGripper
 
-__all__ = ["GripperContract"]
-
 _SLOW = 0.01
 """s; a call whose median is longer blocks."""
 _AT = 2e-3

@@ -16,8 +16,6 @@ from ..rig import Rig, open_rig
 from ..robot import Robot
 from ..specs import BodySpec
 
-__all__ = ["HoldResult", "Thing", "hold_object"]
-
 Thing: TypeAlias = Literal["cube", "cylinder", "plate"]
 
 WIDTH = 0.03

@@ -20,8 +20,6 @@ from ..specs import GroupSpec, RobotSpec
 from ..types import GripperState, RobotState
 from .benches import GripperBench, RobotBench
 
-__all__ = ["HostedGripper", "HostedRobot"]
-
 
 class _BenchHost(Host):
     """A host whose cycles the checks run themselves."""

@@ -15,8 +15,6 @@ from ..errors import CommandError, ConnectionLost, HalError, NotSupported, Robot
 from .benches import Contract, RobotBench, needs, run_in_thread, wait_lost, wait_restored
 from .hosting import HostedRobot
 
-__all__ = ["RobotContract"]
-
 _SLOW = 0.005
 """s; a call whose median is longer blocks. Far more than a cycle allows, for busy machines."""
 _TOO_OLD = 0.3

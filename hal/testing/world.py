@@ -21,8 +21,6 @@ from ..world import WorldDriver
 from .benches import Contract, needs
 from .world_bench import FINGERS, GRAVITY, JOINTS, UPRIGHT, WorldBench, body, cabinet, cube, floor
 
-__all__ = ["WorldContract"]
-
 _PROPERTIES = (
     *("lateral_friction", "rolling_friction", "spinning_friction", "restitution"),
     *("linear_damping", "angular_damping", "contact_stiffness", "contact_damping"),

@@ -14,8 +14,6 @@ from ..specs import BodySpec, GripperSpec, LimitsSpec, RobotSpec, WorldSpec
 from ..world import WorldDriver
 from .benches import Bench, robot_spec
 
-__all__ = ["FINGERS", "GRAVITY", "JOINTS", "UPRIGHT", "WorldBench", "body", "cabinet", "cube", "floor"]
-
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 GRAVITY = 9.81
 _ARM = """<robot name="arm">

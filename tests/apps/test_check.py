@@ -74,6 +74,8 @@ def test_json_has_every_finding() -> None:
         (["--duration", "0"], "--duration must be above 0"),
         (["--config", "panda_tabel"], "did you mean 'panda_table'"),
         (["--physics", "--config", "franka"], "--physics has rigs of its own"),
+        (["--pads", "--duration", "0"], "--duration must be positive"),
+        (["--pads", "--json"], "--json cannot be used with --pads"),
     ],
 )
 def test_a_persons_mistake_is_a_message_not_a_traceback(arguments: list[str], text: str) -> None:

@@ -152,25 +152,3 @@ def test_no_pad_is_said_and_is_the_exit_status(folder: Path) -> None:
     done = run(folder, "--duration", "0.3", pad=None)
     assert (done.returncode, done.stderr) == (2, "")
     assert "no gamepad detected; plug one in at any time" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["--duration", "0"], "--duration must be positive"),
-        (["--json"], "--json cannot be used with --pads"),
-        (["--config", "panda_tabel"], "did you mean 'panda_table'"),
-    ],
-)
-def test_a_persons_mistake_is_a_message_not_a_traceback(folder: Path, arguments: list[str], text: str) -> None:
-    done = run(folder, *arguments)
-    assert done.returncode == 2
-    assert text in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_help_says_what_it_does(folder: Path) -> None:
-    done = run(folder, "--help")
-    assert done.returncode == 0
-    assert "--pads" in done.stdout
-    assert "may be the dead-man of a real arm" in " ".join(done.stdout.split())

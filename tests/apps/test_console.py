@@ -101,11 +101,3 @@ def test_in_lock_step_there_is_nobody_to_drive() -> None:
     assert done.returncode == 2
     assert "real time" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.slow
-def test_the_demo_plays_the_recorded_tour() -> None:
-    command = [sys.executable, str(APP), "--sim", "--pad", "demo", "--set", "cameras={}", "--duration", "4"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert "tour.jsonl" in done.stdout

@@ -16,8 +16,6 @@ from hal.errors import Fault
 from hal.host.process import Channel, Child, pack_error
 from hal.specs import RobotSpec, from_json, to_json
 
-__all__ = ["Apart", "main"]
-
 HERE = str(Path(__file__).parent)
 LIMIT = 20.0
 """s for each call; then the process is killed, and the check fails."""

@@ -21,23 +21,6 @@ from ..kits.drives import ArmWithDrives
 from ..kits.engines_kit import Engine, need_engine
 from ..kits.specs import data, panda
 
-__all__ = [
-    "RenderedWorld",
-    "mock_camera",
-    "mock_camera_in_lock_step",
-    "mock_gripper",
-    "mock_robot",
-    "mock_robot_with_drives",
-    "played_realsense",
-    "pybullet_camera_in_lock_step",
-    "recording",
-    "simulated_gripper",
-    "simulated_robot",
-    "simulated_world",
-    "software_realsense",
-    "three_joints",
-]
-
 FROM_ABOVE = ViewSpec((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
 BALL = BodySpec("ball", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0), "sphere", radius=0.1, mass=1.0)
 FLOOR = BodySpec("floor", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "plane")

@@ -11,8 +11,6 @@ from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
 from hal.testing import GripperBench, RobotBench
 
-__all__ = ["piper_arm", "piper_gripper"]
-
 
 @contextmanager
 def piper_arm() -> Iterator[RobotBench]:

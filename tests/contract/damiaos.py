@@ -14,8 +14,6 @@ from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
 from hal.testing import GripperBench, RobotBench
 
-__all__ = ["damiao_arm", "damiao_gripper"]
-
 YAW = 0
 """The joint of a YAM whose axis is vertical: no weight turns it while its motor is off."""
 

@@ -21,8 +21,6 @@ from hal.pads.mapper import AxisRange
 from hal.pads.model import Identity
 from hal.testing import PadBench, pad_spec
 
-__all__ = ["recorded_pad"]
-
 PADS = ROOT / "tests" / "data" / "pads"
 SOUTH = KEY["BTN_SOUTH"]
 DRIVERS = {"ds4": ("sony", 0), "dualsense": ("playstation", 128)}

@@ -14,8 +14,6 @@ from hal.testing import GripperBench, RobotBench
 from ..wire.franka_kit import Emulator
 from .apart import Apart
 
-__all__ = ["FR3", "franka_hand"]
-
 _AWAY = 0.3
 """Duration of a restart, s."""
 

@@ -10,8 +10,6 @@ from tempfile import TemporaryDirectory
 from hal.drivers.mock.gamepad import MockPad
 from hal.testing import PadBench, pad_spec
 
-__all__ = ["mock_pad", "playback_pad", "terminal_steps", "web_pad"]
-
 
 @contextmanager
 def mock_pad() -> Iterator[PadBench]:

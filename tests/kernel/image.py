@@ -14,8 +14,6 @@ from typing import NamedTuple
 
 from packages import Missing, Package, newest_kernel
 
-__all__ = ["PROGRAM", "TEXT", "Image", "archive", "image_for"]
-
 _MODULES = (
     *("virtio_pci", "9pnet_virtio", "9p"),  # the host's files
     *("evdev", "uinput", "uhid", "hid-generic", "hid-sony", "hid-playstation"),

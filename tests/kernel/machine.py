@@ -13,8 +13,6 @@ from image import PROGRAM, TEXT, Image, archive
 
 from packages import Missing
 
-__all__ = ["Machine"]
-
 _INIT = Path(__file__).with_name("init")
 _QEMU = "qemu-system-x86_64"
 _KERNEL_ARGUMENTS = "console=ttyS0 quiet panic=-1 mitigations=off tsc=reliable no_timer_check random.trust_cpu=on"

@@ -9,8 +9,6 @@ import subprocess
 import tarfile
 from pathlib import Path
 
-__all__ = ["Missing", "Package", "newest_kernel"]
-
 _DOWNLOAD = 300.0  # s
 _FLAVOUR = r"\.[0-9]+[-+][0-9a-z]+-amd64"  # the full kernel: the cloud flavour has neither uinput nor CAN
 

@@ -16,8 +16,6 @@ from unittest import mock
 
 import numpy as np
 
-__all__ = ["CIRCLE", "CROSS", "PS", "SQUARE", "Done", "run_here", "seed_of", "write_pad"]
-
 
 class Done(NamedTuple):
     """How it ended, as subprocess.CompletedProcess says it."""

@@ -7,8 +7,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-__all__ = ["load_benchmark"]
-
 _ROOT = str(Path(__file__).resolve().parents[2])
 
 

@@ -27,8 +27,6 @@ from hal.specs import RobotSpec
 from hal_emulators.can.server import CanEmulator, EmulatedArm
 from hal_emulators.control import EmulatorControl
 
-__all__ = ["CanBench", "EmulatorProcess", "can_overrides", "emulated_arm"]
-
 _START_LIMIT, _END_LIMIT = 60.0, 15.0
 _numbers = itertools.count(1)
 

@@ -23,8 +23,6 @@ import hal
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
 
-__all__ = ["WAYS", "End", "Rest", "Tour", "end", "rest", "tour", "tracking"]
-
 _TELEOP = Path(__file__).resolve().parents[2] / "apps" / "teleop.py"
 SPEED = 0.4
 """Of the joint that moves when a program ends, rad/s."""

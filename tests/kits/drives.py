@@ -7,8 +7,6 @@ from hal.drivers.mock.robot import MockRobot
 from hal.errors import ConnectionLost, RobotFault
 from hal.specs import RobotSpec
 
-__all__ = ["ArmWithDrives"]
-
 
 class ArmWithDrives(MockRobot):
     """One more of its drives is on after each call of :meth:`engage`; a fault or a lost link switches all of them off.

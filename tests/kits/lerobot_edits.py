@@ -22,8 +22,6 @@ from hal.recording import Dataset
 from hal.recording.finish import tasks_table
 from hal.recording.layout import BOOKKEEPING
 
-__all__ = ["edit_as_lerobot"]
-
 ADDED: dict[str, dict[str, Any]] = {
     "reward": {"dtype": "float32", "shape": [1], "names": None},
     "embedding": {"dtype": "float32", "shape": [3], "names": None},

@@ -20,8 +20,6 @@ from hal.drivers.mock.gamepad import MockPad
 from hal.drivers.mock.robot import MockRobot
 from hal.registry import DriverSpec
 
-__all__ = ["TURN", "Loop", "driving", "laboratory", "mock_rig"]
-
 TURN = hal.JointVelocity([0.2, 0, 0, 0, 0, 0, 0])
 PERIOD = 0.02
 """Of the program, s."""

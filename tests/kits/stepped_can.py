@@ -34,8 +34,6 @@ from hal.robot import Robot
 from hal.specs import GroupSpec, RobotSpec
 from hal_emulators.can import console, server
 
-__all__ = ["SteppedArm", "SteppedEmulator", "stepped_arm", "take_for_off"]
-
 Array = NDArray[np.float64]
 
 

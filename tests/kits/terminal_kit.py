@@ -18,8 +18,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-__all__ = ["FarEnd", "InTerminal", "wait_for"]
-
 
 def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0, every: float = 0.002) -> None:
     """Wait until ``condition`` holds; AssertionError after ``timeout`` s."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-__all__ = ["wait_until"]
-
 
 def wait_until(condition: Callable[[], object], what: str = "so", timeout: float = 30.0) -> None:
     """Poll until a condition holds; fail with ``what`` if it does not within ``timeout``, s, on a busy computer."""

@@ -25,12 +25,13 @@ from hal.driver import GripperReading
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
-from hal.drivers.can.damiao_protocol import CLEAR_ERROR, ENABLE, MOTOR_RANGES, MotorCodec, MotorStatus
+from hal.drivers.can.damiao_protocol import CLEAR_ERROR, ENABLE, MOTOR_RANGES, MotorStatus
 from hal.errors import ConfigError, DeviceNotFound, HalError, MotionStopped, RobotFault
 from hal.host.cycle import Cycle
 from hal.host.records import AppRecord, GroupMemory
 from hal.specs import GroupSpec
 from hal.types import GripperOutcome
+from hal_emulators.can.damiao_frames import MotorSide
 
 DT = 0.004
 """Period of a YAM's cycle, s."""
@@ -316,7 +317,7 @@ def test_frames_from_before_the_connect_are_discarded() -> None:
     with SteppedEmulator("yam") as far:
         driver = DamiaoArm(far.spec)
         bus = CanBus.acquire(driver.settings.shared)  # another device of this process has opened it before
-        stale = MotorCodec(MOTOR_RANGES["DM4340"]).encode_feedback(1, 1, 2.0, 5.0, 9.0)
+        stale = MotorSide(MOTOR_RANGES["DM4340"]).encode_feedback(1, 1, 2.0, 5.0, 9.0)
         far.execute(f"frame 0x11 {stale.hex()} 50")
         driver.open()
         reading = driver.read(0.0)

@@ -33,33 +33,34 @@ def installed() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: "-".join(entry.values()))
-def test_a_model_drives_and_closes_its_gripper(engine: Engine, entry: dict[str, Any]) -> None:
+def test_a_model_drives_closes_its_gripper_and_stays_where_a_reset_put_it(
+    engine: Engine, entry: dict[str, Any]
+) -> None:
     with installed():
-        found = robots.run_model(entry, engine.name, poses=10, tour=0.1)
-    assert found.found == 10
-    assert found.position <= 1e-5
-    assert found.trip is Trip.NONE
-    assert found.lag < 0.01
-    if found.widths is not None:
-        assert abs(found.widths[1] - found.width_min) < 2e-3
-        assert found.widths[0] - found.width_min > 0.02
+        rig = robots.open_model(entry, engine.name)
+    with rig:
+        found = robots.drive_model(rig, poses=10, tour=0.1)
+        assert found.found == 10
+        assert found.position <= 1e-5
+        assert found.trip is Trip.NONE
+        assert found.lag < 0.01
+        if found.widths is not None:
+            assert abs(found.widths[1] - found.width_min) < 2e-3
+            assert found.widths[0] - found.width_min > 0.02
+        if rig.robots["arm"].limits.torque is not None:
+            check_that_it_stays(rig)
 
 
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: "-".join(entry.values()))
-def test_a_model_without_torques_stays_where_a_reset_put_it(engine: Engine, entry: dict[str, Any]) -> None:
-    """From the first step on: what the motors left undone in it would be a speed of the arm."""
-    with installed(), hal.open({"robots": {"arm": entry}}, sim=True, clock="lock_step", engine=engine.name) as rig:
-        arm = rig.robots["arm"]
-        if arm.limits.torque is None:
-            pytest.skip("takes no torques")
-        rng, room = np.random.default_rng(2), 0.05
-        for _ in range(3):
-            q = arm.home + rng.uniform(-0.3, 0.3, arm.n)
-            rig.world.reset("arm", q=np.clip(q, np.add(arm.limits.lower, room), np.subtract(arm.limits.upper, room)))
-            start = arm.state().q
-            with arm.control(rate_hz=50) as control:
-                for tick in rig.clock.rate(50):
-                    control.send(hal.JointTorque([0.0] * arm.n))
-                    if tick.elapsed >= 2.0:
-                        break
-            assert np.abs(arm.state().q - start).max() < 2e-3
+def check_that_it_stays(rig: hal.Rig) -> None:
+    """Without torques, from the first step on: what the motors left undone in it would be a speed of the arm."""
+    arm, rng, room = rig.robots["arm"], np.random.default_rng(2), 0.05
+    for _ in range(3):
+        q = arm.home + rng.uniform(-0.3, 0.3, arm.n)
+        rig.world.reset("arm", q=np.clip(q, np.add(arm.limits.lower, room), np.subtract(arm.limits.upper, room)))
+        start = arm.state().q
+        with arm.control(rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                control.send(hal.JointTorque([0.0] * arm.n))
+                if tick.elapsed >= 2.0:
+                    break
+        assert np.abs(arm.state().q - start).max() < 2e-3

@@ -17,8 +17,6 @@ from loop_kit import TURN, Loop, driving, mock_rig
 import hal
 from hal import JointTorque, Trip
 
-__all__ = ["PUSHING", "STOPS", "TICK", "Stop", "check_rows", "code_of", "late", "noisy", "reported", "shows", "wrong"]
-
 ROOT = Path(__file__).parents[2]
 TICK = 1 / 240
 """Period of the mock arm's servo, s."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from child_targets import HURRY
-from web_kit import REST, TOKEN, WAIT, App, Page
+from web_kit import TOKEN, WAIT, App, Page
 
 from hal.drivers.web.messages import PAGE_SILENT
 from hal.errors import Fault, NotSupported
@@ -65,33 +65,6 @@ async def test_too_many_messages_close_the_page_and_a_stop_among_them_counts(app
         assert await page.closed() == 4408
 
 
-async def test_the_lease_between_two_pages(app: App) -> None:
-    async with Page(app) as first:
-        await first.take()
-        assert await app.next() == {"driver": "page 1"}
-        await first.drive([0.5, 0, 0, 0, 1, 0, 0, 0], 64)
-        pad = await app.pad()
-        assert (pad["connected"], pad["from"], pad["buttons"]) == (True, "page 1", 64)
-        assert pad["axes"] == [0.5, 0, 0, 0, 1, 0, 0, 0]
-        assert pad["t"] - PAD_SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
-        async with Page(app) as second:
-            await second.say(type="stop")
-            assert await app.next(lambda message: "stop" in message) == {"stop": "page 2"}
-            await second.say(type="recover", robot="arm")
-            assert "only the page in control" in (await second.next("refused"))["why"]
-            await second.take()
-            assert (await app.pad())["why"] == "page 2 took control"
-            assert await app.next() == {"driver": "page 2"}
-            lost = await first.next("lease")
-            assert (lost["driver"], lost["you"], lost["why"]) == ("page 2", False, "page 2 took control")
-            await first.ws.send_json(first.pad([1.0] * 8))
-            await second.drive()
-            assert (await app.pad())["from"] == "page 2"
-        assert (await app.pad())["why"] == "the page in control is no longer connected"
-        assert await app.next() == {"driver": None}
-        assert (await first.next("lease"))["driver"] is None
-
-
 @pytest.mark.parametrize("how", ["hidden", "closed", "cut"])
 async def test_a_page_that_leaves_loses_the_pad_at_once(app: App, how: str) -> None:
     async with Page(app) as page:
@@ -119,17 +92,6 @@ async def test_a_silent_page_loses_the_pad(app: App) -> None:
         lost = await app.pad()
         assert (lost["connected"], lost["why"]) == (False, PAGE_SILENT)
         assert lost["t"] - pad["t_alive"] > PAD_SILENCE
-
-
-async def test_late_messages_move_nothing(app: App) -> None:
-    async with Page(app) as page:
-        await page.take()
-        await asyncio.sleep(0.5)
-        for age in (0.4, 0.3, 0.2):
-            await page.ws.send_json(page.pad([1.0] * 8, age=age))
-        await page.drive()
-        told = await app.all_until(lambda message: "pad" in message)
-        assert told[-1]["pad"]["axes"] == REST
 
 
 async def test_messages_during_a_stall_of_the_server_move_nothing(app: App) -> None:
@@ -211,22 +173,6 @@ async def test_nan_reaches_no_page_as_a_number(app: App) -> None:
             app.put_state(time.monotonic(), q=float("nan"))
             state = await page.next("state")
         assert state["robots"]["arm"]["q"] == [None] * 3
-
-
-async def test_messages_of_the_app(app: App) -> None:
-    async with Page(app) as page:
-        await page.next("hello")
-        app.send("labels", labels={"deadman": "l2", "home": None})
-        assert await page.next("labels") == {"type": "labels", "deadman": "l2", "home": None}
-        app.send("say", t=1.5, text="grüß Gott")
-        assert await page.next("say") == {"type": "say", "t": 1.5, "text": "grüß Gott"}
-        app.send("waiting", controls=["r2"])
-        assert await page.next("pad") == {"type": "pad", "waiting": ["r2"]}
-        app.send("playing", on=True)
-        while not (await page.next("state"))["playing"]:
-            pass
-        app.send("refused", page="page 1", why="not now")
-        assert (await page.next("refused"))["why"] == "not now"
 
 
 # A page that reads nothing.

@@ -9,8 +9,6 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["DEADMAN", "SECONDS", "Held", "write_pad", "write_tour"]
-
 SECONDS = 11.0
 _STICKS = {name: [0, 255, 15] for name in ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY", "ABS_Z", "ABS_RZ")}
 _HEAD = {

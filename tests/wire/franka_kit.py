@@ -25,8 +25,6 @@ from typing import Any
 
 from hal_emulators.control import EmulatorControl
 
-__all__ = ["Client", "Emulator", "free_host", "run_client"]
-
 LIBRARIES = {"fr3": "pylibfranka", "panda": "panda_py"}
 """The vendor's library of each robot."""
 PORTS = (1337, 1338, 1339)

@@ -16,8 +16,6 @@ from hal_emulators.franka.hand import HandServer
 
 from .franka_kit import free_host
 
-__all__ = ["LIMIT", "HandBench"]
-
 LIMIT = 15.0
 """Longest wait for any condition, on a busy machine, s."""
 _TURN = 0.005

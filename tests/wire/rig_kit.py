@@ -14,8 +14,6 @@ from hal.rig import Rig
 from hal.robot import Robot
 from hal.types import RobotState, RobotStatus
 
-__all__ = ["Drive", "arm_of", "rig_of", "settled"]
-
 
 def rig_of(host: str, robot: str = "fr3", *more: str, lock_step: bool = False, sim: bool = False) -> Rig:
     """Open the emulator's rig without cameras and, unless ``more`` enables it, without its hand."""

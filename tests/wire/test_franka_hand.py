@@ -137,30 +137,6 @@ def test_a_stop_leaves_the_fingers_where_they_are(bench, brisk):
     assert (bench.read().width, bench.read().fault, bench.requests["stop"]) == (width, None, 1)
 
 
-def test_an_ignored_stop_is_reported_and_the_next_command_waits(bench, brisk):
-    bench.command("stop-ignored on")
-    bench.hand.move(0.06, 0.02, 40.0)
-    bench.wait(lambda r: r.width > 0.041)
-    bench.hand.stop()
-    reading = bench.wait(lambda r: r.fault is not None)
-    assert (reading.outcome, reading.fault.code, reading.moving) == (STOPPED, "stop_ignored", True)
-    assert bench.do("move", 0.07, 0.1, 40.0).outcome is DONE
-    assert bench.read().width == pytest.approx(0.07, abs=0.002)
-
-
-def test_a_stop_that_drops_the_object_is_reported(bench, brisk):
-    """States and answers are late, so at the stop it is unknown whether the fingers hold something."""
-    for words in ("stop-releases on", "object 0.03", "slow-reply 0.8"):
-        bench.command(words)
-    bench.hand.grasp(0.03, 0.04, 40.0, 0.005, 0.005)
-    bench.wait_server(lambda state: state["motion"] == "grasp")
-    bench.command("silence 0.5")
-    bench.wait_server(lambda state: state["is_grasped"])
-    bench.hand.stop()
-    reading = bench.wait(lambda r: r.fault is not None)
-    assert (reading.outcome, reading.fault.code, reading.grasped) == (STOPPED, "stop_released", False)
-
-
 def test_a_motion_that_the_hand_refuses_has_failed(bench):
     bench.command("fail")
     reading = bench.do("move", 0.08, 0.1, 40.0)

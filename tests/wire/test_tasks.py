@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
 CUBE = "{name: cube, shape: box, half_extents: [0.025, 0.025, 0.025], mass: 0.2, rgba: [0.85, 0.2, 0.2, 1.0]}"
 VIEW = "look_at: {target: [-0.1, 0, 0.7], distance: 0.85, yaw_deg: 60, pitch_deg: -30}"
 CAMERA = f"{{sim: true, model: pinhole, streams: [color, depth], output: {{width: 256, height: 256}}, {VIEW}}}"
-STEPS = 100
+STEPS, FEW = 100, 50
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +48,7 @@ def true_pose(task: Any) -> hal.Pose:
 
 
 def test_an_arm_that_only_moves_above_the_cube_has_not_solved_the_task_at_its_end(env: Any) -> None:
+    env = gymnasium.wrappers.TimeLimit(env, FEW)
     seen, _ = env.reset(seed=3)
     task = env.unwrapped
     assert env.observation_space.contains(seen)
@@ -59,7 +60,7 @@ def test_an_arm_that_only_moves_above_the_cube_has_not_solved_the_task_at_its_en
         moved, steps = max(moved, float(np.linalg.norm(seen["tcp"][:3] - start))), steps + 1
         assert (terminated, info["success"], reward < 0.0) == (False, False, True)
         assert "stopped" not in info
-    assert (steps, moved > 0.03) == (STEPS, True)
+    assert (steps, moved > 0.03) == (FEW, True)
 
 
 def test_the_verdict_on_a_scripted_episode_is_the_truth_of_the_bench(env: Any) -> None:

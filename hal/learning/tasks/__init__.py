@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import gymnasium
 
-__all__ = ["TASKS"]
-
 TASKS = {
     "PickCube": ("pick_cube", 200),
     "PushCube": ("push_cube", 200),

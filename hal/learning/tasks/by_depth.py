@@ -15,8 +15,6 @@ from ...skills.depth import largest_cluster
 from ...types import Frame
 from ..gym import RigEnv
 
-__all__ = ["DepthJudge", "find_cube", "select_points"]
-
 Array = NDArray[np.float64]
 
 _LEAST = 30

@@ -14,8 +14,6 @@ from ...observation import Observation
 from ...robot import Robot
 from ..gym import RigEnv
 
-__all__ = ["Hand", "fold", "yaw_of"]
-
 Array = NDArray[np.float64]
 
 GRASP_HEIGHT = 0.03

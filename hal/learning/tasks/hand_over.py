@@ -8,8 +8,6 @@ from ...geometry import Pose
 from .hand import GRASP_HEIGHT
 from .task_env import CLOSED, HEIGHT, OPEN, Action, TaskEnv, closeness
 
-__all__ = ["HandOver"]
-
 LENGTH, WIDTH, TALL = 0.24, 0.03, 0.05
 """Size of the bar along x, y and z, m."""
 ENDS = ((-0.085, 0.0, 0.0), (0.085, 0.0, 0.0))

@@ -8,8 +8,6 @@ from typing import Any
 from ...geometry import Pose
 from .task_env import CLOSED, HEIGHT, OPEN, Action, TaskEnv, closeness
 
-__all__ = ["OpenDrawer"]
-
 POST = (-0.12, 0.0, 0.045)
 """Middle of the post on the closed drawer in the frame of the cabinet, m; the fingers take it."""
 WIDTH = 0.03

@@ -10,8 +10,6 @@ from ...geometry import Pose
 from .hand import Array
 from .task_env import CLOSED, OPEN, Action, TaskEnv, closeness
 
-__all__ = ["PegInHole"]
-
 RADIUS = 0.02
 """Of the peg, m; the hole is a square of 48 mm."""
 LENGTH = 0.09

@@ -9,8 +9,6 @@ import numpy as np
 from ...geometry import Pose
 from .task_env import CLOSED, GRASP_HEIGHT, HEIGHT, OPEN, Action, TaskEnv, closeness, cube_entry, goal_entry
 
-__all__ = ["PickCube"]
-
 SIDE = 0.05
 """Of the cube, m."""
 NEAR = 0.025

@@ -9,8 +9,6 @@ import numpy as np
 from ...geometry import Pose
 from .task_env import GRASP_HEIGHT, Action, TaskEnv, closeness, cube_entry, goal_entry
 
-__all__ = ["PushCube"]
-
 SIDE = 0.05
 """Of the cube, m."""
 NEAR = 0.025

@@ -10,8 +10,6 @@ from ...geometry import Pose
 from .hand import Array
 from .task_env import CLOSED, GRASP_HEIGHT, HEIGHT, OPEN, Action, TaskEnv, closeness, cube_entry
 
-__all__ = ["StackCubes"]
-
 SIDE = 0.05
 """Of both cubes, m."""
 APART = 0.1

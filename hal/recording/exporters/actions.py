@@ -17,8 +17,6 @@ from ...geometry import apply_rotation, difference, quaternion_to_matrix
 from ..layout import ACTION, SETPOINT
 from .content import ArmColumns, EpisodeContent
 
-__all__ = ["ActionForm", "ActionKind", "RotationForm", "action_dict", "rotation_observations"]
-
 Array = NDArray[np.float64]
 ActionKind = Literal["joint_position", "joint_velocity", "tcp_pose", "tcp_delta"]
 RotationForm = Literal["quaternion", "axis_angle", "rotation_6d"]

@@ -17,21 +17,6 @@ from ...types import STREAMS
 from ..dataset import Dataset, Episode
 from ..layout import GRIP_FORCE, MORE_STREAMS, STATE, TAU_EXT, WRENCH_EXT
 
-__all__ = [
-    "ArmColumns",
-    "CAMERA",
-    "EpisodeContent",
-    "GRIPPER_CAMERA",
-    "PictureStream",
-    "select_episodes",
-    "parse_episodes",
-    "observations",
-    "picture_name",
-    "camera_roles",
-    "add_channel",
-]
-
-
 _PART = re.compile(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?")
 
 

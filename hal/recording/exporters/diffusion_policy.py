@@ -14,14 +14,6 @@ from numpy.typing import NDArray
 from .content import EpisodeContent, add_channel, picture_name
 from .output import ExportJob
 
-__all__ = [
-    "GROUP",
-    "ZarrArray",
-    "is_export",
-    "make_group",
-    "write",
-]
-
 # The zarr format, version 2, which every zarr library reads: an array is a JSON file (``.zarray``) and a file per
 # chunk; a group is a folder with another JSON file. Chunks are compressed with zstd after their bytes are shuffled,
 # which halves them.

@@ -20,8 +20,6 @@ from ..layout import STATE
 from .content import EpisodeContent, camera_roles
 from .output import ExportJob
 
-__all__ = ["is_export", "write"]
-
 _ABOUT = "export.json"
 _LEVEL = 1  # higher levels take far longer and save little
 

@@ -20,12 +20,6 @@ from ..layout import STATE
 from .actions import ActionForm, rotation_observations
 from .content import EpisodeContent, PictureStream, observations
 
-__all__ = [
-    "ExportJob",
-    "ExportProgress",
-    "write_atomically",
-]
-
 
 class ExportProgress(NamedTuple):
     """Progress of an export."""

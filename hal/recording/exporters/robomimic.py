@@ -14,8 +14,6 @@ from .actions import action_dict
 from .content import EpisodeContent, PictureStream, add_channel, picture_name
 from .output import ExportJob
 
-__all__ = ["is_export", "write"]
-
 _GYM = 2
 """robomimic's number of a Gymnasium environment, the only kind that needs none of its simulators."""
 _MAGIC = b"\x89HDF\r\n\x1a\n"

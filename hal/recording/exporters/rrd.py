@@ -16,8 +16,6 @@ from ..dataset import Episode
 from ..layout import SETPOINT, STATE
 from .content import ArmColumns, EpisodeContent, PictureStream
 
-__all__ = ["write_rrd"]
-
 _TIMELINE = "episode"
 _QUALITY = 90
 _DEPTH_UNITS = 10_000.0

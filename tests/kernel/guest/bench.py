@@ -12,8 +12,6 @@ from typing import Any
 
 from gesture import Motors
 
-__all__ = ["Bench"]
-
 _ANSWER = 20.0  # s
 
 

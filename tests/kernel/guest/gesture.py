@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
-__all__ = ["Device", "Gesture", "Make", "Motors", "Output"]
-
 
 class Gesture(NamedTuple):
     """Names as in ``hal.types``: sticks and d-pad -1..1, right and up positive; triggers 0..1."""

@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 from hal.types import BUTTONS, STICK_AXES
 
-__all__ = ["KINDS", "Kind"]
-
 _KERNEL = tuple(int(number) for number in re.findall(r"\d+", os.uname().release)[:2])
 _DUALSHOCK4 = "playstation" if _KERNEL >= (6, 2) else "sony"
 

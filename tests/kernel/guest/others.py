@@ -12,8 +12,6 @@ from evdev import ecodes
 from gesture import Gesture, Make, Output
 from uhid import BUS_USB, HidDevice, HidIdentity
 
-__all__ = ["SpaceMouse", "UnknownPad"]
-
 _REACH = 350
 
 

@@ -12,8 +12,6 @@ import hid
 from gesture import Gesture, Make, Motors
 from uhid import BUS_BLUETOOTH, BUS_USB, HidDevice, HidIdentity
 
-__all__ = ["DualSense", "DualShock4"]
-
 _VENDOR = 0x054C
 _ADDRESS = bytes.fromhex("0123456789ab")
 _HAT = {(0, 1): 0, (1, 1): 1, (1, 0): 2, (1, -1): 3, (0, -1): 4, (-1, -1): 5, (-1, 0): 6, (-1, 1): 7}

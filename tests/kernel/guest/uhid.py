@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 from gesture import Output
 
-__all__ = ["BUS_BLUETOOTH", "BUS_USB", "HidDevice", "HidIdentity"]
-
 BUS_USB, BUS_BLUETOOTH = 0x03, 0x05
 
 _DESTROY, _OPEN, _CLOSE, _OUTPUT, _GET_REPORT, _GET_REPORT_REPLY = 1, 4, 5, 6, 9, 10

@@ -14,8 +14,6 @@ from typing import NamedTuple
 
 from gesture import Output
 
-__all__ = ["UsbDevice", "UsbIdentity"]
-
 _CONTROLLER = Path("/sys/devices/platform/vhci_hcd.0")
 _PORTS, _FULL_SPEED = 8, 2
 

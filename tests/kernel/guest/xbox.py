@@ -10,8 +10,6 @@ import struct
 from gesture import Gesture, Make, Motors
 from usbip import UsbDevice, UsbIdentity
 
-__all__ = ["Xbox360", "XboxOne"]
-
 
 class Xbox360(Make):
     """The pad of the Xbox 360."""

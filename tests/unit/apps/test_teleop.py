@@ -1,4 +1,4 @@
-"""``apps/teleop.py`` in this process: the recorded tour in lock-step, dry runs, mistakes, the help."""
+"""``apps/teleop.py`` in this process: the recorded tour in lock-step, dry runs, mistakes."""
 
 from __future__ import annotations
 
@@ -69,10 +69,3 @@ def test_a_mistake_is_a_message(arguments: list[str], texts: list[str]) -> None:
     assert done.returncode == 2
     for text in texts:
         assert text in done.stderr
-
-
-def test_help_names_every_option() -> None:
-    done = run_here(main, "--help")
-    assert done.returncode == 0
-    for option in ["config", "sim", "real", "pad", "viewer", "duration", "speed", "set", "report", "dry-run"]:
-        assert f"--{option}" in done.stdout

@@ -154,21 +154,6 @@ def test_torques_need_a_driver_and_a_model_that_take_them(arm: hal.Robot, monkey
         control.send(torque)
 
 
-def test_a_first_target_far_away_is_refused(rig: hal.Rig, arm: hal.Robot) -> None:
-    tcp = arm.state().tcp
-    far = [
-        JointTarget(arm.state().q + 0.2),
-        hal.CartesianTarget(hal.Pose(tcp.position, [0, 1, 0, 0])),
-        hal.CartesianTarget(hal.Pose(tcp.position + np.array([0.1, 0, 0]), tcp.orientation)),
-    ]
-    with arm.control() as control:
-        for command in far:
-            with raises_code(CommandError, "first_step_too_far"):
-                control.send(command)
-        rig.clock.sleep(0.1)
-    assert np.array_equal(arm.state().q, arm.home)
-
-
 def test_a_pose_beyond_reach_is_refused_in_mid_session_too(rig: hal.Rig, arm: hal.Robot) -> None:
     pose = arm.state().tcp
     with arm.control() as control:

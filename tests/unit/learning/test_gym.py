@@ -24,6 +24,7 @@ from hal.gym import EnvSettings, RigEnv  # noqa: E402
 from hal.world import World  # noqa: E402
 
 BARE = ("cameras={}",)
+SMALL = tuple(f"cameras.{name}.output.{size}" for name in ("scene", "wrist") for size in ("width=64", "height=48"))
 
 
 def test_a_missing_gymnasium_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,9 +43,7 @@ def test_one_name_in_place_of_a_list_is_refused(argument: str) -> None:
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*")
 @pytest.mark.parametrize("action", ["joint", "tcp_delta", "twist"])
 def test_it_passes_gymnasiums_own_checks(action: str) -> None:
-    env = RigEnv(
-        "panda_table", EnvSettings(action=action, max_steps=50), sim=True, overrides=("cameras.scene.output.width=64",)
-    )
+    env = RigEnv("panda_table", EnvSettings(action=action, max_steps=50), sim=True, overrides=SMALL)
     try:
         check_env(env, skip_render_check=True)
     finally:

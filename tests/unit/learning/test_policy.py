@@ -256,24 +256,6 @@ def test_what_a_policy_raises_ends_the_episode_and_the_arm_is_at_rest(
     assert is_at_rest(rig)
 
 
-@pytest.mark.parametrize("kind", ["target", "chunk", "pose"])
-def test_a_first_target_that_is_far_away_is_refused(rig: Rig, kind: str) -> None:
-    before = rig.robots["panda"].state()
-
-    def policy(observation: hal.Observation) -> hal.Command:
-        state, t = observation.robots["panda"], observation.t
-        if kind == "target":
-            return hal.JointTarget(state.q - 0.2)
-        if kind == "chunk":
-            return hal.JointChunk([t, t + 1.0], [state.q - 0.2, state.q])
-        return hal.CartesianTarget(hal.Pose(state.tcp.position + [0, 0, 0.1], state.tcp.orientation))
-
-    outcome = PolicyRunner(rig, policy).run()
-    assert outcome.ended == "error"
-    assert "use move_to first" in outcome.reason
-    assert rig.robots["panda"].state().q == pytest.approx(before.q, abs=1e-9), "nothing moved"
-
-
 def test_a_first_answer_may_take_longer_but_not_for_ever(rig: Rig) -> None:
     def thinks(seconds: float) -> Callable[[hal.Observation], hal.Twist]:
         turn = 0

@@ -6,8 +6,6 @@ import json
 import socket
 from typing import Any
 
-__all__ = ["CONTROL_PORT", "EmulatorControl"]
-
 CONTROL_PORT = 1339
 """TCP port of a Franka's emulator; that of emulated buses is a free one, which it prints."""
 

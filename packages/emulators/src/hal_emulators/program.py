@@ -14,8 +14,6 @@ from importlib import import_module
 
 from hal.errors import HalError
 
-__all__ = ["main", "parser"]
-
 DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand"}
 
 

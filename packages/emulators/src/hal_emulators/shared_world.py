@@ -13,8 +13,6 @@ from hal.config.loader import load
 from hal.drivers.scene.shared import Connection
 from hal.errors import ConnectionLost
 
-__all__ = ["ArmInWorld", "has_world", "run_world"]
-
 _PERIOD = 0.004
 """Time between two reports of an arm, s."""
 _START = 60.0

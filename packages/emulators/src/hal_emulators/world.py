@@ -33,8 +33,6 @@ from hal.errors import CommandError, ConnectionLost, ControlTaken, HalError
 from hal.host.process import pack_error
 from hal.specs import RobotSpec, WorldSpec
 
-__all__ = ["ArmOfWorld", "WorldServer", "main"]
-
 _LONGEST_GAP = 5.0
 """Time for which the world catches up, s."""
 _SILENT = 1.0

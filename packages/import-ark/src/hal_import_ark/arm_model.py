@@ -14,12 +14,6 @@ from hal.registry import SIMULATION
 from .output import Commented, Inline, KeyReport, Remark
 from .reading import ArkNode, ArkReader
 
-__all__ = [
-    "ArkUrdf",
-    "ArmModel",
-    "arm_model",
-]
-
 
 class ArkUrdf:
     """Joints and links of a URDF as Ark counts and places them, through PyBullet.

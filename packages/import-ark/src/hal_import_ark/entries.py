@@ -15,16 +15,6 @@ from hal.geometry import matrix_to_quaternion, rpy_to_matrix
 from .output import Commented, KeyReport
 from .reading import ArkNode, ArkReader, FileFinder, InvalidValue
 
-__all__ = [
-    "ArkItem",
-    "ArkOptions",
-    "ArkRotation",
-    "ImportState",
-    "position_of",
-    "rotation_of",
-    "tidy",
-]
-
 
 class ArkRotation(NamedTuple):
     """A quaternion x, y, z, w, with a comment if it was converted."""

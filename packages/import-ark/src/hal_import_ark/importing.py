@@ -21,8 +21,6 @@ from .reading import ArkNode, ArkReader, FileFinder, InvalidValue
 from .robots import ArkArm, import_arm
 from .scene import import_camera, import_object, import_simulator
 
-__all__ = ["Imported", "import_ark"]
-
 
 @dataclass(frozen=True)
 class Imported:

@@ -16,19 +16,6 @@ from hal.config.schema import describe
 
 from .reading import PACKAGE, ArkNode, PackageFile
 
-__all__ = [
-    "Commented",
-    "Inline",
-    "KeyReport",
-    "Outcome",
-    "Remark",
-    "KeyRow",
-    "plain",
-    "summary",
-    "table",
-    "yaml_text",
-]
-
 _WIDTH = 110
 
 

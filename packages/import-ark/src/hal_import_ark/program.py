@@ -18,8 +18,6 @@ from .entries import ArkOptions
 from .importing import Imported, import_ark
 from .output import summary, table
 
-__all__ = ["main", "parser"]
-
 
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""

@@ -14,14 +14,6 @@ from hal.config.schema import describe, is_number
 from hal.errors import ConfigError
 from hal.kinematics.mesh_files import package_folder
 
-__all__ = [
-    "ArkNode",
-    "PackageFile",
-    "FileFinder",
-    "ArkReader",
-    "InvalidValue",
-]
-
 UPWARDS = 4
 """Searched folders above the global file; the tutorial's robots are three levels above its folder."""
 PACKAGE = "pybullet_data"

@@ -18,19 +18,6 @@ from .entries import ArkItem, ArkOptions, ImportState, position_of, rotation_of
 from .output import Commented, Inline, KeyReport, Remark, plain
 from .reading import ArkNode, ArkReader, FileFinder
 
-__all__ = [
-    "ArkArm",
-    "FIXED_LINKS",
-    "FRANKAS",
-    "JOINT_COUNTS",
-    "KnownArm",
-    "LINKS",
-    "TCP_LINK",
-    "franka_with",
-    "import_arm",
-    "import_real",
-]
-
 FRANKAS = {"panda": "panda_", "fr3": "fr3_"}
 """Models of Franka's arms, and the prefix of their joints and links."""
 JOINT_COUNTS = (7, 9, 10, 12)

@@ -25,11 +25,13 @@ from hal.drivers.can.damiao_motor import ChainMotor, register_problems
 from hal.drivers.can.damiao_protocol import MotorRegister, MotorStatus
 from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
-from hal.drivers.can.piper_protocol import GripperRequest, JointTargets, decode_command
+from hal.drivers.can.piper_protocol import GripperRequest, JointTargets
 from hal.drivers.can.settings import BusSettings, DamiaoMotorSettings
 from hal.errors import ConfigError, ConnectionLost, ControlTaken, RobotFault
 from hal.host.cycle import ArmUnit
 from hal.types import RobotStatus
+from hal_emulators.can.damiao_frames import MotorSide
+from hal_emulators.can.piper_frames import decode_command
 from hal_emulators.can.server import CanEmulator
 
 from ....kits.can_kit import can_overrides
@@ -182,10 +184,11 @@ def test_motors_do_not_race_when_a_program_is_killed_in_torque_mode(yam: Bench, 
 def test_direction_and_offset_turn_position_velocity_and_torque_alike(direction: float) -> None:
     settings = DamiaoMotorSettings(id=1, type="DM4310", kp=10.0, kd=1.0, direction=direction, offset=0.3)
     motor = ChainMotor(settings, "joint1")
-    q, dq, kp, kd, tau = motor.codec.decode_command(motor.command(0.8, 2.0, 10.0, 1.0, -4.0))
+    codec = MotorSide(motor.codec.limits)
+    q, dq, kp, kd, tau = codec.decode_command(motor.command(0.8, 2.0, 10.0, 1.0, -4.0))
     assert (q, dq, tau) == pytest.approx((direction * 0.5, direction * 2.0, direction * -4.0), abs=0.015)
     assert (kp, kd) == pytest.approx((10.0, 1.0), abs=0.13)
-    motor.receive(bytearray(motor.codec.encode_feedback(1, 1, direction * 0.5, direction * 2.0, direction * -4.0)))
+    motor.receive(bytearray(codec.encode_feedback(1, 1, direction * 0.5, direction * 2.0, direction * -4.0)))
     motor.decode()
     assert (motor.q, motor.dq, motor.tau) == pytest.approx((0.8, 2.0, -4.0), abs=0.015)
 

@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 
 from hal.drivers.can import damiao_protocol as protocol
 from hal.drivers.can.damiao_protocol import MOTOR_RANGES, MotorCodec, MotorRange
+from hal_emulators.can import damiao_frames as motor_side
+from hal_emulators.can.damiao_frames import MotorSide
 
 DM4340 = MotorCodec(MOTOR_RANGES["DM4340"])
-DM4310 = MotorCodec(MOTOR_RANGES["DM4310"])
+DM4310 = MotorSide(MOTOR_RANGES["DM4310"])
 
 GOLDEN_COMMANDS = [
     ((0.0, 0.0, 0.0, 0.0, 0.0), "7fff 7ff0 0000 07ff"),
@@ -40,9 +42,9 @@ def test_zero_encodes_to_half_a_step_below_zero() -> None:
 
 
 def test_special_commands_have_their_golden_bytes() -> None:
-    names = ("ENABLE", "DISABLE", "SET_ZERO", "CLEAR_ERROR")
-    assert [getattr(protocol, name)[-1] for name in names] == [0xFC, 0xFD, 0xFE, 0xFB]
-    assert all(getattr(protocol, name)[:7] == b"\xff" * 7 for name in names)
+    commands = (protocol.ENABLE, protocol.DISABLE, motor_side.SET_ZERO, protocol.CLEAR_ERROR)
+    assert [data[-1] for data in commands] == [0xFC, 0xFD, 0xFE, 0xFB]
+    assert all(data[:7] == b"\xff" * 7 for data in commands)
 
 
 def test_feedback_has_its_golden_bytes() -> None:
@@ -61,11 +63,10 @@ def test_feedback_has_its_golden_bytes() -> None:
     [
         (protocol.encode_state_request(3), "0300cc0000000000"),
         (protocol.encode_register_read(1, protocol.MotorRegister.PMAX), "0100331500000000"),
-        (protocol.encode_register_write(2, protocol.MotorRegister.TIMEOUT, 8000), "02005509401f0000"),
-        (protocol.encode_register_write(2, protocol.MotorRegister.VMAX, 10.0), "0200551600002041"),
-        (protocol.encode_save(0x107), "0701aa0100000000"),
-        (protocol.encode_register_reply(1, protocol.MotorRegister.PMAX, 12.5), "0100331500004841"),
-        (protocol.encode_register_reply(7, protocol.MotorRegister.CTRL_MODE, 1), "0700330a01000000"),
+        (motor_side.encode_register_reply(2, protocol.MotorRegister.TIMEOUT, 8000, 0x55), "02005509401f0000"),
+        (motor_side.encode_register_reply(2, protocol.MotorRegister.VMAX, 10.0, 0x55), "0200551600002041"),
+        (motor_side.encode_register_reply(1, protocol.MotorRegister.PMAX, 12.5), "0100331500004841"),
+        (motor_side.encode_register_reply(7, protocol.MotorRegister.CTRL_MODE, 1), "0700330a01000000"),
     ],
 )
 def test_register_frames_have_their_golden_bytes(data: bytes, expected: str) -> None:
@@ -90,7 +91,7 @@ def step_down(value: float, decoded: float, lowest: float, highest: float, steps
 
 @given(limits, anything, anything, anything, anything, anything)
 def test_commands_round_trip(limits: MotorRange, q: float, dq: float, kp: float, kd: float, tau: float) -> None:
-    codec = MotorCodec(limits)
+    codec = MotorSide(limits)
     found = codec.decode_command(codec.encode_command(q, dq, kp, kd, tau))
     step_down(q, found.q, -limits.position, limits.position, 65535)
     step_down(dq, found.dq, -limits.velocity, limits.velocity, 4095)
@@ -103,7 +104,7 @@ def test_commands_round_trip(limits: MotorRange, q: float, dq: float, kp: float,
 def test_feedback_round_trips(
     limits: MotorRange, motor: int, status: int, q: float, dq: float, tau: float, heat: int
 ) -> None:
-    codec = MotorCodec(limits)
+    codec = MotorSide(limits)
     found = codec.decode_feedback(codec.encode_feedback(motor, status, q, dq, tau, heat, 255 - heat))
     assert (found.motor, found.status, found.mosfet, found.rotor) == (motor & 15, status, heat, 255 - heat)
     step_down(q, found.q, -limits.position, limits.position, 65535)
@@ -149,12 +150,13 @@ FLOATS = st.sampled_from([0, 2, 4, 11, 17, 21, 22, 23, 29])
 )
 def test_register_values_round_trip(motor: int, content: tuple[int, float]) -> None:
     register, value = content
-    reply = protocol.encode_register_reply(motor, register, value)
+    reply = motor_side.encode_register_reply(motor, register, value)
     assert protocol.decode_register_reply(reply, motor) == (register, value)
     assert protocol.decode_register_reply(reply, motor % 0x7FE + 1) is None
-    request = protocol.decode_register_request(protocol.encode_register_write(motor, register, value))
+    written = motor_side.encode_register_reply(motor, register, value, protocol.WRITE_REGISTER)
+    request = motor_side.decode_register_request(written)
     assert request == (motor, protocol.WRITE_REGISTER, register, value)
-    read = protocol.decode_register_request(protocol.encode_register_read(motor, register))
+    read = motor_side.decode_register_request(protocol.encode_register_read(motor, register))
     assert read is not None
     assert read[:3] == (motor, protocol.READ_REGISTER, register)
 
@@ -165,10 +167,10 @@ def test_feedback_of_a_motor_is_no_register_reply(motor: int, status: int, q: fl
 
 
 def test_a_state_request_names_its_motor() -> None:
-    request = protocol.decode_register_request(protocol.encode_state_request(5))
+    request = motor_side.decode_register_request(protocol.encode_state_request(5))
     assert request is not None
     assert request[:2] == (5, protocol.STATE_REQUEST)
-    assert protocol.decode_register_request(b"\x05\x00") is None
+    assert motor_side.decode_register_request(b"\x05\x00") is None
 
 
 @pytest.mark.parametrize("limits", [(0.0, 1.0, 1.0), (12.5, -1.0, 1.0), (12.5, 1.0, math.nan)])

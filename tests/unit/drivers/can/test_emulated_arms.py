@@ -16,11 +16,12 @@ from hal.drivers.can.damiao_protocol import (
     MotorStatus,
     decode_register_reply,
     encode_register_read,
-    encode_register_write,
     encode_state_request,
 )
 from hal.drivers.can.piper_protocol import (
     ENABLED,
+    FEEDBACK_IDS,
+    POSE_ID,
     EnableRequest,
     FirmwareQuery,
     GripperRequest,
@@ -95,7 +96,7 @@ def test_motors_answer_at_their_master_ids_and_show_their_registers(yam: Wire) -
         (answer,) = yam.ask(REGISTER_ID, encode_register_read(motor, MotorRegister.VMAX))
         assert yam.sent[0][0] == motor + 0x10
         assert decode_register_reply(answer, motor).value == (10.0 if motor <= 3 else 30.0)
-    (answer,) = yam.ask(REGISTER_ID, encode_register_write(2, MotorRegister.TIMEOUT, 0))
+    (answer,) = yam.ask(REGISTER_ID, bytes((2, 0, 0x55, MotorRegister.TIMEOUT, 0, 0, 0, 0)))
     assert decode_register_reply(answer, 2).value == 0
     assert yam.ask(REGISTER_ID, encode_register_read(9, MotorRegister.VMAX)) == []
     assert yam.ask(0x99, b"\0" * 8) == []
@@ -169,11 +170,14 @@ def test_temperatures_are_reported(yam: Wire) -> None:
 
 
 def test_a_piper_reports_at_its_rates_without_being_asked(piper: Wire) -> None:
-    decoded = [decode_feedback(id, data) for id, data, _ in piper.let_pass(0.5)]
+    sent = piper.let_pass(0.5)
+    decoded = [decode_feedback(id, data) for id, data, _ in sent]
     assert sum(isinstance(record, PiperStatus) for record in decoded) == pytest.approx(100, abs=1)
     assert sum(isinstance(record, JointAngles) for record in decoded) == pytest.approx(300, abs=3)
     assert sum(isinstance(record, JointStatus) for record in decoded) == pytest.approx(120, abs=6)
-    assert all(record is not None for record in decoded)
+    assert {id for id, *_ in sent} == set(FEEDBACK_IDS)
+    unread = {id for (id, *_), record in zip(sent, decoded, strict=True) if record is None}
+    assert unread == {POSE_ID, POSE_ID + 1, POSE_ID + 2}, "the driver does without the flange's pose"
 
 
 def switch_on(piper: Wire, speed_percent: int = 100) -> None:

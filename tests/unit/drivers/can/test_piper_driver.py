@@ -14,6 +14,7 @@ from hal.drivers.can import piper_protocol as protocol
 from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
 from hal.errors import ConnectionLost, DeviceNotFound, RobotFault
+from hal_emulators.can.piper_frames import EmergencyRequest, decode_command, encode_report
 
 DT = 0.005
 ZEROS = (0.0,) * 6
@@ -98,8 +99,8 @@ def test_no_frame_could_let_the_arm_fall(bench: Bench) -> None:
     bench.run(0.2)
     bench.engage()
     bench.driver.close()
-    sent = [protocol.decode_command(*frame) for frame in bench.sent()]
-    assert not any(isinstance(command, protocol.EmergencyRequest) for command in sent)
+    sent = [decode_command(*frame) for frame in bench.sent()]
+    assert not any(isinstance(command, EmergencyRequest) for command in sent)
     enables = [command for command in sent if isinstance(command, protocol.EnableRequest)]
     assert enables
     assert all(command.enabled for command in enables)
@@ -342,14 +343,15 @@ def test_a_grippers_error_fails_its_command_and_the_next_one_clears_it(bench: Be
     gripper.move(0.05, 0.1, 20.0)
     assert run(1.0) == pytest.approx(0.05, abs=1e-3)
     send, status = bench.far.bus.send, protocol.GripperStatus(0.05, 0.0, protocol.ENABLED | protocol.OVER_CURRENT)
-    with patch.object(bench.far.bus, "send", lambda id, data: send(id, status.frame()[1] if id == 0x2A8 else data)):
+    report = encode_report(status)[1]
+    with patch.object(bench.far.bus, "send", lambda id, data: send(id, report if id == 0x2A8 else data)):
         run(0.02)
         fault = gripper.read(bench.now).fault
         assert fault is not None
         assert fault.code == "over_current"
         bench.sent()
         gripper.move(0.03, 0.1, 20.0)
-        command = protocol.decode_command(*bench.sent()[0])
+        command = decode_command(*bench.sent()[0])
         assert isinstance(command, protocol.GripperRequest)
         assert command.clear_error
         assert command.torque == pytest.approx(0.5)

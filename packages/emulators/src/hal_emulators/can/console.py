@@ -20,8 +20,6 @@ from typing import Any, NamedTuple
 
 from .server import CanEmulator, EmulatedArm, EmulatedBus
 
-__all__ = ["COMMANDS", "CommandPort", "execute", "help_text", "serve_prompt"]
-
 _FOREVER = 1e9
 """Stands for no end, s."""
 

@@ -18,25 +18,19 @@ from hal.drivers.can.damiao_protocol import (
     MIT_MODE,
     READ_REGISTER,
     REGISTER_ID,
-    SAVE_REGISTERS,
-    SET_ZERO,
     STATE_REQUEST,
     TIMEOUT_UNIT,
     WRITE_REGISTER,
-    MotorCodec,
     MotorRange,
     MotorRegister,
     MotorStatus,
-    decode_register_request,
-    encode_register_reply,
 )
 from hal.drivers.can.settings import DamiaoArmSettings, DamiaoGripperSettings, DamiaoMotorSettings
 from hal.specs import RobotSpec
 from hal_emulators.shared_world import ArmInWorld
 
+from .damiao_frames import SAVE_REGISTERS, SET_ZERO, MotorSide, decode_register_request, encode_register_reply
 from .plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
-
-__all__ = ["EmulatedDamiaoArm", "DamiaoMotor", "shorted_damping"]
 
 Send = Callable[[int, bytes, int], None]
 """Sends a frame: id, data, and the number of the motor that it comes from."""
@@ -109,7 +103,7 @@ class DamiaoMotor:
     def set_ranges(self) -> None:
         """Use the ranges in the registers from now on."""
         names = MotorRegister.PMAX, MotorRegister.VMAX, MotorRegister.TMAX
-        self.codec = MotorCodec(MotorRange(*(self.registers[name] for name in names)))
+        self.codec = MotorSide(MotorRange(*(self.registers[name] for name in names)))
 
     def step(self, dt: float) -> Drive:
         """Let ``dt``, s, pass, and return what the motor does now, on the joint's side."""

@@ -20,9 +20,6 @@ from hal.drivers.can.piper_protocol import (
     MOVE_J,
     STANDBY,
     TORQUE_PER_AMPERE,
-    AccelerationLimit,
-    Acknowledgement,
-    EmergencyRequest,
     EnableRequest,
     FirmwareQuery,
     GripperRequest,
@@ -37,18 +34,22 @@ from hal.drivers.can.piper_protocol import (
     ModeRequest,
     ParameterQuery,
     PiperStatus,
-    decode_command,
-    encode_joint_angles,
-    encode_pose,
-    firmware_pieces,
 )
 from hal.drivers.can.settings import PiperArmSettings, PiperGripperSettings
 from hal.specs import RobotSpec
 from hal_emulators.shared_world import ArmInWorld
 
+from .piper_frames import (
+    AccelerationLimit,
+    Acknowledgement,
+    EmergencyRequest,
+    decode_command,
+    encode_joint_angles,
+    encode_pose,
+    encode_report,
+    firmware_pieces,
+)
 from .plant import OFF, ArmPlant, Drive, JointMechanics
-
-__all__ = ["EmulatedPiperArm"]
 
 Send = Callable[[int, bytes, int], None]
 """Sends a frame: id, data, and the number of the motor that it comes from (0 for the controller)."""
@@ -147,14 +148,14 @@ class EmulatedPiperArm:
                     if content == 2
                     else JointLimits(motor, self.plant.upper[k], self.plant.lower[k], _SPEED)
                 )
-                send(*answer.frame(), 0)
+                send(*encode_report(answer), 0)
             case ParameterQuery(content=4):
-                send(*GripperStroke(round(self._stroke * 1e3)).frame(), 0)
+                send(*encode_report(GripperStroke(round(self._stroke * 1e3))), 0)
             case FirmwareQuery():
                 for frame in firmware_pieces(self.firmware):
                     send(*frame, 0)
         if id >= 0x470 and not isinstance(command, FirmwareQuery):
-            send(*Acknowledgement(id & 0xFF).frame(), 0)
+            send(*encode_report(Acknowledgement(id & 0xFF)), 0)
 
     def _enable(self, motor: int, enabled: bool) -> None:
         chosen = [motor - 1] if 1 <= motor <= JOINTS else range(JOINTS)
@@ -230,21 +231,21 @@ class EmulatedPiperArm:
     def _report(self, send: Send) -> None:
         plant = self.plant
         moving = max(abs(a - b) for a, b in zip(self.target, plant.q.tolist(), strict=True)) > 2e-3
-        send(*PiperStatus(self.control, self.status, self.move, moving=int(moving)).frame(), 0)
+        send(*encode_report(PiperStatus(self.control, self.status, self.move, moving=int(moving))), 0)
         position, angles = plant.flange()
         for frame in (*encode_pose(position.tolist(), angles.tolist()), *encode_joint_angles(plant.q.tolist())):
             send(*frame, 0)
         flags = HOMED | (ENABLED if self._gripper.enabled else 0)
-        send(*GripperStatus(self.gripper_width, self._gripper_torque, flags).frame(), 0)
+        send(*encode_report(GripperStatus(self.gripper_width, self._gripper_torque, flags)), 0)
         for k in range(JOINTS):
             current = float(plant.tau[k]) / TORQUE_PER_AMPERE[k]
-            send(*JointMotion(k, float(plant.dq[k]), current, float(plant.q[k])).frame(), k + 1)
+            send(*encode_report(JointMotion(k, float(plant.dq[k]), current, float(plant.q[k]))), k + 1)
 
     def _report_slow(self, send: Send) -> None:
         for k in range(JOINTS):
             driver, motor = self._temperatures[k]
             flags = self.flags[k] | (ENABLED if self.enabled[k] else 0)
-            send(*JointStatus(k, 24.0, driver, motor, flags).frame(), k + 1)
+            send(*encode_report(JointStatus(k, 24.0, driver, motor, flags)), k + 1)
 
     def report(self) -> dict[str, Any]:
         """Return the state of the controller, for programs and people."""

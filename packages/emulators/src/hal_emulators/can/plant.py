@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from hal.specs import KinematicsSpec
 
-__all__ = ["ArmPlant", "Drive", "GripperPlant", "JointMechanics"]
-
 _STOP_STIFFNESS, _STOP_DAMPING = 2000.0, 50.0
 """A joint's mechanical stop, Nm/rad and Nm s/rad."""
 _SWEEPS = 4

@@ -29,8 +29,6 @@ from .damiao import EmulatedDamiaoArm
 from .piper import EmulatedPiperArm
 from .plant import ArmPlant
 
-__all__ = ["CanEmulator", "EmulatedArm", "EmulatedBus", "FrameFaults"]
-
 _STEP = 1e-3
 """Step of the mechanics, s."""
 _LONGEST_GAP = 0.25

@@ -37,8 +37,6 @@ from .protocol import (
 )
 from .settings import SETTERS, ClientSettings
 
-__all__ = ["ArmReply", "EmulatedArm", "RequestHandler", "RobotFiles"]
-
 _MANUAL_ERRORS = frozenset({"joint_position_limits_violation"})
 """Errors that are cleared only by guiding the arm by hand. Which ones is an assumption."""
 

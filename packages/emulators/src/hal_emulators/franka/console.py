@@ -25,8 +25,6 @@ from .faults import COMMANDS, help_text
 from .journal import Counters
 from .server import ArmServer, listen
 
-__all__ = ["CommandConsole", "Executor", "HandCommands"]
-
 Words = list[str]
 Answer = dict[str, Any]
 

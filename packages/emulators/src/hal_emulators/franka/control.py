@@ -13,8 +13,6 @@ from hal_emulators.control import EmulatorControl
 
 from .faults import help_text
 
-__all__ = ["main"]
-
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the program, and return its exit status."""

@@ -11,8 +11,6 @@ from typing import NamedTuple
 
 from .motion import DT, Floats, MotionSample
 
-__all__ = ["COMMANDS", "InjectedFaults", "PacketLoss", "SetpointReports", "Unrest", "help_text"]
-
 _SWING = 0.08
 """Share of its distance from the set-point by which an arm in unrest moves back and forth, a cycle each."""
 

@@ -30,8 +30,6 @@ from .hand_network import (
     hand_response,
 )
 
-__all__ = ["HAND_COMMANDS", "HAND_CONTROL_PORT", "HandFaults", "HandServer", "main"]
-
 # Commands.
 
 HAND_COMMANDS = {

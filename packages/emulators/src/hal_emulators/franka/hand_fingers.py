@@ -12,8 +12,6 @@ from enum import Enum
 
 from .hand_network import HandStatus
 
-__all__ = ["FULL_WIDTH", "Fingers", "FingerMotionKind", "FingerMotion"]
-
 FULL_WIDTH = 0.08
 """Width of completely open fingers, m."""
 _SPEED_MAX = 0.1  # m/s of the width: 50 mm/s for each finger

@@ -15,19 +15,6 @@ from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
-__all__ = [
-    "HAND_PORT",
-    "HAND_VERSION",
-    "HandClient",
-    "HandCode",
-    "HandNetwork",
-    "HandRequest",
-    "HandRequestParser",
-    "HandStatePacket",
-    "HandStatus",
-    "hand_response",
-]
-
 # Messages.
 
 HAND_PORT = 1338

@@ -9,8 +9,6 @@ from typing import Any
 
 from hal.histogram import Histogram
 
-__all__ = ["STALL", "Counters", "Journal"]
-
 STALL = 0.02
 """Lateness of a cycle above which its time and length are recorded, s."""
 _KEPT = 1000

@@ -16,8 +16,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-__all__ = ["write_model_library"]
-
 Numbers = NDArray[Any]
 """An array of floats and :class:`Number`."""
 

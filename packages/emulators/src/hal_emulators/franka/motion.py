@@ -18,24 +18,6 @@ from hal.drivers.franka.limits import ArmLimits
 
 from .protocol import CommandPacket, Controller, Generator, RequestOutcome
 
-__all__ = [
-    "DT",
-    "LOST_LIMIT",
-    "EmulatedMotion",
-    "Ending",
-    "LimitChecker",
-    "MotionSample",
-    "MoveOptions",
-    "Tolerances",
-    "Violation",
-    "at_rest",
-    "braked",
-    "step_position",
-    "step_velocity",
-    "extrapolate",
-    "read_move",
-]
-
 # Samples: one millisecond of commanded motion.
 
 DT = 1e-3

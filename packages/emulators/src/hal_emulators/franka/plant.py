@@ -19,20 +19,6 @@ from numpy.typing import NDArray
 
 from .motion import DT, Floats, MotionSample
 
-__all__ = [
-    "FLANGE_TO_HAND",
-    "IDENTITY",
-    "IdealPlant",
-    "LaggingPlant",
-    "Plant",
-    "Pose16",
-    "PyBulletPlant",
-    "RigidBody",
-    "arm_only",
-    "multiply",
-    "remove_shapes",
-]
-
 Pose16 = tuple[float, ...]
 """A 4x4 matrix by columns, as in packets."""
 

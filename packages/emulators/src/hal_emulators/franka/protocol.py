@@ -16,28 +16,6 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
-__all__ = [
-    "COMMAND",
-    "FLAG_COUNT",
-    "HEADER",
-    "PORT",
-    "PROTOCOLS",
-    "STATE",
-    "CommandPacket",
-    "Controller",
-    "ControllerMode",
-    "FieldSpan",
-    "FrankaProtocol",
-    "Generator",
-    "GeneratorMode",
-    "PacketLayout",
-    "RequestOutcome",
-    "RequestType",
-    "RobotMode",
-    "StatePacket",
-    "read_command",
-]
-
 # Requests.
 
 PORT = 1337

@@ -23,8 +23,6 @@ from .journal import Counters
 from .motion import DT
 from .protocol import HEADER, PORT, CommandPacket, RequestOutcome, read_command
 
-__all__ = ["ArmClient", "ArmServer", "Pacing", "listen"]
-
 # Timing.
 
 

@@ -13,8 +13,6 @@ from typing import Any
 
 from .plant import FLANGE_TO_HAND, IDENTITY, Pose16, multiply
 
-__all__ = ["SETTERS", "ClientSettings"]
-
 Values = tuple[float, ...]
 
 _ROTATION = 1e-5

@@ -16,8 +16,6 @@ from .feeder import FrameFeeder, SentFrames
 from .pictures import make_serial, make_title
 from .settings import Emulation
 
-__all__ = ["SoftwareCamera"]
-
 
 class SoftwareCamera:
     """A D435 that can be plugged into any number of contexts, streams what is requested, and can be unplugged.

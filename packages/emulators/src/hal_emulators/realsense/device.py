@@ -22,8 +22,6 @@ from hal.geometry import Pose, quaternion_to_matrix
 
 from .pictures import DEPTH_UNIT, EmulatedStream, PinholeLens, StreamMode
 
-__all__ = ["ContextEntry", "DevicesRemoved", "EmulatedDevice", "emulated_context", "load_realsense"]
-
 _KINDS = {"depth": ("depth", 0), "color": ("color", 0), "infrared": ("infrared", 1), "infrared_right": ("infrared", 2)}
 _BYTES = {"z16": 2, "y8": 1, "rgb8": 3, "bgr8": 3, "yuyv": 2, "uyvy": 2, "rgba8": 4, "bgra8": 4}
 

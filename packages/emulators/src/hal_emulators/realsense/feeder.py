@@ -20,8 +20,6 @@ from .device import EmulatedDevice, load_realsense
 from .pictures import PHASES, EmulatedImages, StreamMode, draw_number, make_serial, make_streams, make_title
 from .settings import CameraFaults, Emulation
 
-__all__ = ["FrameFeeder", "SentFrames", "write_recording"]
-
 _IDLE = 0.02
 """s between two checks whether a stream is on."""
 _WRAP = 2**32 * 1e-6

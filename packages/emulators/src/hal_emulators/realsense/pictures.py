@@ -18,26 +18,6 @@ from numpy.typing import NDArray
 from hal.geometry import Pose, quaternion_to_matrix
 from hal.specs import CameraSpec
 
-__all__ = [
-    "BITS",
-    "DEPTH_UNIT",
-    "INK",
-    "PHASES",
-    "SIZES",
-    "STEP",
-    "EmulatedScene",
-    "EmulatedStream",
-    "PinholeLens",
-    "StreamMode",
-    "EmulatedImages",
-    "draw_number",
-    "make_serial",
-    "make_streams",
-    "make_title",
-    "read_number",
-    "strip_height",
-]
-
 Array = NDArray[np.float64]
 
 # Streams, modes and lenses.

@@ -9,8 +9,6 @@ from difflib import get_close_matches
 
 from hal.errors import CommandError
 
-__all__ = ["CLOCKS", "PATTERNS", "CameraFaults", "Emulation"]
-
 PATTERNS = ("test", "scene")
 CLOCKS = ("hardware", "global", "system")
 _STREAMS = ("color", "depth", "infrared", "infrared_right")
