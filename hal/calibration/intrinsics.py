@@ -11,8 +11,6 @@ from .board import opencv
 from .detection import Detector, NoView
 from .solving import CalibrationFailed
 
-__all__ = ["LEAST_PICTURES", "LensFit", "LensViews"]
-
 Array = NDArray[np.float64]
 
 LEAST_PICTURES = 8
