@@ -64,6 +64,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "pybullet": "hal.drivers.pybullet:DRIVER",
         "realsense": "hal.drivers.realsense:DRIVER",
         "terminal": "hal.drivers.terminal:DRIVER",
+        "ur": "hal.drivers.ur:DRIVER",
         "viser": "hal.drivers.viser:DRIVER",
         "web": "hal.drivers.web:DRIVER",
     }

@@ -1,6 +1,7 @@
-"""The program ``hal emulate``: a Franka arm with its hand, or every arm on a CAN bus of a rig.
+"""The program ``hal emulate``: a Franka arm with its hand, a UR arm, or every arm on a CAN bus of a rig.
 
 hal emulate franka --robot fr3
+hal emulate ur --robot ur5e
 hal emulate can --config yam_emulator
 """
 
@@ -12,7 +13,7 @@ from importlib import import_module
 
 __all__ = ["main", "parser"]
 
-DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand"}
+DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand", "ur": "a UR arm"}
 
 
 def parser() -> argparse.ArgumentParser:

@@ -1,0 +1,236 @@
+"""Driver of a UR arm: the servo's set-points go to ``servoj`` at the controller's rate, states come by RTDE.
+
+* ``engage`` starts the control program of ur_rtde, with the controller's watchdog; ``halt`` leaves the arm at its last
+  set-point, which the program keeps. ``open`` starts no program: it works while another one runs, and in local control.
+* What ends the program, or scales its speed, is a fault until ``recover``. Only that unlocks a protective stop.
+"""
+
+from __future__ import annotations
+
+import time
+from math import inf
+from typing import Any, ClassVar
+
+from hal.driver import Reading, RobotDriver, Setpoint
+from hal.errors import ConnectionLost, Fault, RobotFault
+from hal.geometry import difference
+from hal.specs import RobotSpec
+
+from .faults import (
+    LOCAL,
+    NOT_FOLLOWING,
+    PLAYING,
+    PROGRAM_STOPPED,
+    PROTECTIVE_STOP,
+    RUNNING,
+    SAFETY,
+    SILENT,
+    UNLOCK_AFTER,
+    WATCHDOG,
+    mode_fault,
+    scaling_fault,
+)
+from .link import WATCHDOG_HZ, UrLink
+from .settings import UrSettings
+
+_SILENCE = 0.12
+"""Time without a new state after which the connection counts as lost, s."""
+_EXPLAIN = 0.05
+"""Longest time to find out why a program ended, s."""
+_FULL = 0.995
+"""Share of the full speed below which set-points would run away."""
+_LAG = 0.06
+"""Time by which the target may follow later than by its lookahead, s, and a distance, rad: chosen."""
+_POLL = 2e-4
+"""s"""
+FLANGE = "tool0"
+"""Link of UR's models whose frame is the controller's flange."""
+
+
+class UrArm(RobotDriver):
+    """An arm of an e-Series or CB3 controller, as its settings say (:class:`~.settings.UrSettings`)."""
+
+    paces_itself: ClassVar[bool] = True
+
+    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        self.settings = UrSettings.of(spec)
+        self.engaged = False
+        self._link = UrLink(spec.name, self.settings, spec.rate_hz, find_tcp(spec) if self.settings.set_tcp else None)
+        self._period = 1.0 / spec.rate_hz
+        self._farthest = max(spec.limits.velocity) * (self.settings.lookahead_time + _LAG) + _LAG
+        self._clear()
+
+    def _clear(self) -> None:
+        self._fault: Fault | None = None
+        """Fault of a session, until recover()."""
+        self._last: Reading | None = None
+        self._t_new = -inf
+        self._t_ended = self._t_protective = inf
+        """Since when the control program is over, and a protective stop lasts, s."""
+
+    def open(self) -> None:
+        """Connect. Nothing moves, and no program is started."""
+        self.close()
+        self._clear()
+        try:
+            self._link.open()
+        except BaseException:
+            self._link.close()
+            raise
+
+    def close(self) -> None:
+        """End the control program: the arm holds. Idempotent."""
+        self.engaged = False
+        self._link.close()
+
+    # Every cycle.
+
+    def wait(self) -> None:
+        """Wait for the next state, for two cycles at most."""
+        receive, last = self._link.receive, self._last
+        end = time.monotonic() + 2.0 * self._period
+        seen = last.t_device if last is not None else 0.0
+        while time.monotonic() < end:
+            time.sleep(_POLL)
+            if receive is not None and receive.getTimestamp() != seen:
+                return
+
+    def read(self, now: float) -> Reading:
+        link, last = self._link, self._last
+        receive = link.receive
+        if receive is None:
+            raise ConnectionLost(f"{self.spec.name} is not open")
+        t = receive.getTimestamp()
+        if last is not None and t == last.t_device:
+            if now - self._t_new > _SILENCE or not receive.isConnected():
+                self.engaged = False
+                link.lose()
+                raise ConnectionLost.of(self.spec.name, SILENT)
+            return last
+        self._t_new = now
+        target = receive.getTargetQ()
+        fault = self._judge(now, receive.getSafetyMode(), receive.getRuntimeState() == PLAYING, target)
+        # A target lags by the lookahead time, so while set-points are sent the last one that was sent is reported.
+        taken = link.sent if self.engaged and link.sent is not None else target
+        self._last = Reading(
+            now,
+            t,
+            round(t * self.spec.rate_hz),
+            receive.getActualQ(),
+            receive.getActualQd(),
+            q_commanded=taken,
+            wrench_ext=receive.getActualTCPForce(),
+            fault=fault,
+        )
+        return self._last
+
+    def engage(self) -> None:
+        """Start the control program, or continue to: the arm holds."""
+        link = self._link
+        fault = self._fault or (self._last.fault if self._last is not None else None) or link.refused
+        if fault is not None:
+            link.refused = None
+            raise RobotFault(fault.cause, fault.remedy, code=fault.code)
+        if link.running:
+            self.engaged = True
+        elif not link.starting:
+            link.start()
+
+    def write(self, setpoint: Setpoint) -> bool:
+        if not self._link.running or self._fault is not None:
+            return False
+        self._link.send(list(setpoint.q))
+        return True
+
+    def halt(self) -> None:
+        """Leave the arm at its last set-point: the control program keeps it."""
+
+    def statistics(self) -> dict[str, Any]:
+        return {"longest_gap_s": self._link.longest_gap}
+
+    # Faults.
+
+    def _judge(self, now: float, safety: int, playing: bool, target: list[float]) -> Fault | None:
+        """Return the fault of this state; one of a session stays until recover()."""
+        link = self._link
+        if safety != PROTECTIVE_STOP:
+            self._t_protective = inf
+        elif self._t_protective == inf:
+            self._t_protective = now
+        fault = self._find_fault(safety, playing) or (self._judge_program(now, playing, target) if self.engaged else None)
+        if not playing:
+            link.note_stopped()
+        if self.engaged and fault is not None:
+            self._fault, self.engaged = fault, False
+        return fault or self._fault
+
+    def _find_fault(self, safety: int, playing: bool) -> Fault | None:
+        """Return what keeps the arm from moving now."""
+        receive = self._link.receive
+        if safety in SAFETY:
+            return SAFETY[safety]
+        mode, slider = receive.getRobotMode(), receive.getTargetSpeedFraction()
+        if mode != RUNNING:
+            return mode_fault(mode)
+        if slider < _FULL:
+            return scaling_fault(slider, slider=True)
+        scaling = receive.getSpeedScaling()
+        return scaling_fault(scaling, slider=False) if self.engaged and playing and scaling < _FULL else None
+
+    def _judge_program(self, now: float, playing: bool, target: list[float]) -> Fault | None:
+        """Return why the control program ended, or does not follow.
+
+        None if all is well, and for the moment that it takes to find out.
+        """
+        link, sent = self._link, self._link.sent
+        if playing and link.running:
+            off = 0.0 if sent is None else max(abs(a - b) for a, b in zip(sent, target, strict=True))
+            return NOT_FOLLOWING if off > self._farthest else None
+        if self._t_ended == inf:
+            self._t_ended, link.local = now, False
+            link.ask_remote()
+        if not link.local and now - self._t_ended < _EXPLAIN:
+            return None
+        self._t_ended = inf
+        if link.local:
+            return LOCAL
+        return WATCHDOG if link.longest_gap > 0.7 / WATCHDOG_HZ else PROGRAM_STOPPED
+
+    def recover(self) -> None:
+        """Clear a fault; unlock a protective stop. Blocks for at most 4 s.
+
+        Raises:
+            RobotFault: Where the controller is not ready; ``code`` is the fault's.
+            ConnectionLost: If it does not answer.
+        """
+        receive = self._link.receive
+        if receive is None or not receive.isConnected():
+            raise ConnectionLost.of(self.spec.name, SILENT)
+        if receive.getSafetyMode() == PROTECTIVE_STOP:
+            self._unlock()
+        self._fault, self._t_ended = None, inf
+        fault = self._find_fault(receive.getSafetyMode(), playing=False)
+        if fault is not None:
+            raise RobotFault(fault.cause, fault.remedy, code=fault.code)
+
+    def _unlock(self) -> None:
+        """Unlock a protective stop. Raises RobotFault."""
+        stop, receive = SAFETY[PROTECTIVE_STOP], self._link.receive
+        wait = self._t_protective + UNLOCK_AFTER - time.monotonic()
+        if wait > 0.0:
+            raise RobotFault(stop.cause, f"the controller unlocks it in {wait:.1f} s; then call recover()", code=stop.code)
+        end = time.monotonic() + 1.0
+        unlocked = self._link.unlock()
+        while unlocked and receive.getSafetyMode() == PROTECTIVE_STOP and time.monotonic() < end:
+            time.sleep(0.01)
+        if receive.getSafetyMode() == PROTECTIVE_STOP:
+            raise RobotFault(stop.cause, f"the controller did not unlock it; {stop.remedy}", code=stop.code)
+
+
+def find_tcp(spec: RobotSpec) -> list[float] | None:
+    """Return the model's tcp in the frame of the flange, m and a rotation vector, rad; None if it is on another link."""
+    k = spec.kinematics
+    if k.tcp_link != FLANGE:
+        return None
+    return difference((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (*k.tcp_position, *k.tcp_orientation))

@@ -1,0 +1,272 @@
+"""Connection to a UR controller through ur_rtde, and the thread that makes every call which may block.
+
+ur_rtde's constructors keep Python's lock while they wait, so they are called only after the ports have answered, and only
+in :meth:`UrLink.open`. Its other calls release the lock. Its objects are never deleted, as that keeps the lock, too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import dashboard_client
+import rtde_control
+import rtde_receive
+
+from hal.errors import ConnectionLost, Fault
+from hal.lock import DeviceLock
+
+from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN
+from .settings import UrSettings
+
+__all__ = ["WATCHDOG_HZ", "UrLink", "lock_arm", "probe"]
+
+RTDE, DASHBOARD, SCRIPTS = 30004, 29999, 30002
+WATCHDOG_HZ = 8.0
+"""The controller ends the control program if nothing comes for the inverse of this: 125 ms."""
+_KICK = 0.02
+"""Time after which the watchdog is kicked if no set-point was sent, s."""
+_START = 0.8
+"""Longest time until the control program runs, s."""
+_RETRY = 0.5
+"""Time between attempts to connect again, s."""
+_VARIABLES = ["timestamp", "target_q", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "robot_mode"]
+_VARIABLES += ["safety_mode", "runtime_state", "speed_scaling", "target_speed_fraction", "safety_status_bits"]
+_VARIABLES += ["robot_status_bits"]
+_PAYLOAD = ["payload", "payload_cog"]
+_kept: list[Any] = []
+"""Objects of ur_rtde, until the process ends."""
+
+
+def lock_arm(host: str) -> DeviceLock:
+    """Reserve the arm at ``host`` for this process. Raises ControlTaken."""
+    return DeviceLock(f"ur-{host}", f"the arm at {host}", patience=1.0)
+
+
+def probe(host: str, timeout: float = 1.0) -> str:
+    """Return why a controller does not answer, naming the port; an empty text if it does.
+
+    Its RTDE port must answer a request, and its dashboard must greet.
+    """
+    for port, request in ((DASHBOARD, b""), (RTDE, b"\0\5V\0\2"), (SCRIPTS, None)):
+        try:
+            with socket.create_connection((host, port), timeout) as line:
+                if request is not None:
+                    line.sendall(request)
+                    if not line.recv(64):
+                        return f"port {port} of {host} hangs up"
+        except OSError as error:
+            return f"port {port} of {host}: {error.strerror or error}"
+    return ""
+
+
+class UrLink:
+    """A connection. The attributes are written by one thread and read by the other.
+
+    Args:
+        name: The arm's name.
+        settings: Its settings.
+        rate_hz: Rate of states and set-points.
+        tcp: The tcp in the frame of the flange (m, rotation vector in rad); None to leave the installation's.
+    """
+
+    def __init__(self, name: str, settings: UrSettings, rate_hz: float, tcp: list[float] | None) -> None:
+        self.name, self.settings, self.rate_hz, self.tcp = name, settings, rate_hz, tcp
+        self.receive: Any = None
+        """ur_rtde's RTDEReceiveInterface; None until open."""
+        self.running = False
+        """Whether the control program runs, and takes set-points."""
+        self.refused: Fault | None = None
+        """Why the control program was not started."""
+        self.local = False
+        """Whether the controller was in local control when that was last asked."""
+        self.sent: list[float] | None = None
+        """The newest set-point that was sent, rad; None before the first one of a program."""
+        self.longest_gap = 0.0
+        """Longest time between two messages since the program started, s."""
+        self.starting = False
+        self._target: list[float] | None = None
+        self._wake = threading.Condition()
+        self._jobs: list[Callable[[], None]] = []
+        self._thread: threading.Thread | None = None
+        self._ours = self._closing = False
+        self._lock: DeviceLock | None = None
+
+    # Called by the cycle.
+
+    def open(self) -> None:
+        """Connect. Raises ConnectionLost and ControlTaken."""
+        host = self.settings.host
+        self._lock = lock_arm(host)
+        why = probe(host)
+        if why:
+            raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
+        try:
+            self._dashboard = dashboard_client.DashboardClient(host)
+            self._dashboard.connect()
+            version = [int(part) for part in self._dashboard.polyscopeVersion().split(".")[:2]]
+            self._has_remote = version >= [5, 6]
+            variables = _VARIABLES + (_PAYLOAD if version >= [5, 6] or [3, 11] <= version < [4, 0] else [])
+            upper = self.settings.upper_registers
+            self.receive = rtde_receive.RTDEReceiveInterface(host, self.rate_hz, variables, False, upper)
+            flags = rtde_control.RTDEControlInterface
+            chosen = int(flags.FLAG_NO_WAIT) | int(flags.FLAG_DISABLE_REMOTE_CONTROL_CHECK)  # no program is started
+            chosen |= int(flags.FLAG_UPPER_RANGE_REGISTERS) if upper else 0
+            self._control = rtde_control.RTDEControlInterface(host, self.rate_hz, chosen)
+        except (RuntimeError, ValueError) as error:  # all that ur_rtde raises
+            self.receive = None
+            if "registers are already in use" in str(error):
+                raise ConnectionLost.of(self.name, REGISTERS_TAKEN) from None
+            raise ConnectionLost(f"{self.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code) from error
+        _kept.extend((self._dashboard, self.receive, self._control))
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=f"ur-{self.name}", daemon=True)
+        self._thread.start()
+
+    def send(self, q: list[float]) -> None:
+        """Send a set-point soon; a newer one replaces one that is waiting."""
+        with self._wake:
+            self._target = q
+            self._wake.notify()
+
+    def start(self) -> None:
+        """Start the control program soon: then ``running`` is True, or ``refused`` says why not."""
+        self.refused, self.starting = None, True
+        self._call(self._start)
+
+    def note_stopped(self) -> None:
+        """Note that no program is running."""
+        if not self.starting:
+            self.running = self._ours = False
+
+    def ask_remote(self) -> None:
+        """Ask soon whether the controller is in local control."""
+        self._call(self._ask_remote)
+
+    def unlock(self) -> bool:
+        """Unlock a protective stop, and return whether the controller did. Blocks for at most 3 s."""
+        answers: list[bool] = []
+        done = threading.Event()
+
+        def unlock() -> None:
+            try:
+                self._dashboard.closeSafetyPopup()
+                answers.append(bool(self._dashboard.unlockProtectiveStop()))
+            finally:
+                done.set()
+
+        self._call(unlock)
+        done.wait(3.0)
+        return answers == [True]
+
+    def lose(self) -> None:
+        """Note that the controller is silent: what it does is no longer known."""
+        self.running, self._target = False, None
+
+    def close(self) -> None:
+        """End the control program, and disconnect. Idempotent."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join(4.0)
+        self.running, self.receive = False, None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _call(self, job: Callable[[], None]) -> None:
+        with self._wake:
+            self._jobs.append(job)
+            self._wake.notify()
+
+    # The thread.
+
+    def _run(self) -> None:
+        receive, control = self.receive, self._control
+        last = 0.0
+        while not self._closing:
+            with self._wake:
+                if not self._jobs and self._target is None:
+                    self._wake.wait(_KICK)
+                target, self._target = self._target, None
+                jobs, self._jobs = self._jobs, []
+            try:
+                if not receive.isConnected() or not control.isConnected():
+                    self.lose()
+                    self._reconnect(receive, control)
+                    continue
+                for job in jobs:
+                    job()
+                if jobs and self.sent is None:
+                    last = time.monotonic()
+                if self.running:
+                    now = time.monotonic()
+                    self.longest_gap = max(self.longest_gap, now - last)
+                    last = now
+                    self._serve(control, target)
+            except RuntimeError as error:
+                print(f"{self.name}: ur_rtde: {error}", file=sys.stderr)
+                self.lose()
+        for end in (control.stopScript if self._ours else None, control.disconnect, receive.disconnect):
+            if end is not None:
+                with contextlib.suppress(RuntimeError):
+                    end()
+
+    def _serve(self, control: Any, target: list[float] | None) -> None:
+        if target is None:
+            control.kickWatchdog()
+        elif control.servoJ(
+            target, 0.0, 0.0, 1.0 / self.rate_hz, self.settings.lookahead_time, self.settings.gain
+        ):
+            self.sent = target
+
+    def _reconnect(self, receive: Any, control: Any) -> None:
+        for _ in range(int(_RETRY / _KICK)):
+            time.sleep(_KICK)
+            if self._closing:
+                return
+        if probe(self.settings.host):
+            return
+        if not receive.isConnected():
+            receive.reconnect()
+        if not control.isConnected():
+            control.reconnect()
+        self._dashboard.disconnect()
+        self._dashboard.connect()
+
+    def _ask_remote(self) -> None:
+        self.local = self._has_remote and not self._dashboard.isInRemoteControl()
+
+    def _start(self) -> None:
+        try:
+            self.refused = self._start_program()
+            self.running = self.refused is None
+        finally:
+            self.starting = False
+
+    def _start_program(self) -> Fault | None:
+        """Start the control program with its watchdog; return why that was not possible."""
+        control, load = self._control, self.settings.load
+        self._ask_remote()
+        if self.local:
+            return LOCAL
+        if self.receive.getRuntimeState() == PLAYING and not self._ours:
+            return OTHER_PROGRAM
+        self._ours, self._target, self.sent, self.longest_gap = True, None, None, 0.0
+        end = time.monotonic() + _START
+        control.reuploadScript()  # also ends an old one of ours
+        while not (control.isProgramRunning() and self.receive.getRuntimeState() == PLAYING):
+            if time.monotonic() > end:
+                return NOT_STARTED
+            time.sleep(0.002)
+        ready = control.setWatchdog(WATCHDOG_HZ)
+        ready = ready and (self.tcp is None or control.setTcp(self.tcp))
+        ready = ready and (load is None or control.setPayload(load.mass, list(load.com)))
+        return None if ready else NOT_STARTED
