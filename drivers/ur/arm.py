@@ -33,6 +33,8 @@ from .faults import (
 from .link import WATCHDOG_HZ, UrLink
 from .settings import UrSettings
 
+_LONGEST_WAIT = 0.02
+"""s"""
 _SILENCE = 0.12
 """Time without a new state after which the connection counts as lost, s."""
 _EXPLAIN = 0.05
@@ -57,7 +59,6 @@ class UrArm(RobotDriver):
         self.settings = UrSettings.of(spec)
         self.engaged = False
         self._link = UrLink(spec.name, self.settings, spec.rate_hz, find_tcp(spec) if self.settings.set_tcp else None)
-        self._period = 1.0 / spec.rate_hz
         self._farthest = max(spec.limits.velocity) * (self.settings.lookahead_time + _LAG) + _LAG
         self._clear()
 
@@ -65,9 +66,9 @@ class UrArm(RobotDriver):
         self._fault: Fault | None = None
         """Fault of a session, until recover()."""
         self._last: Reading | None = None
-        self._t_new = -inf
-        self._t_ended = self._t_protective = inf
-        """Since when the control program is over, and a protective stop lasts, s."""
+        self._t_new, self._lost = -inf, False
+        self._t_ended = inf
+        """Since when the control program is over, s."""
 
     def open(self) -> None:
         """Connect. Nothing moves, and no program is started."""
@@ -87,9 +88,9 @@ class UrArm(RobotDriver):
     # Every cycle.
 
     def wait(self) -> None:
-        """Wait for the next state, for two cycles at most."""
+        """Wait for the next state, for a bounded time."""
         receive, last = self._link.receive, self._last
-        end = time.monotonic() + 2.0 * self._period
+        end = time.monotonic() + _LONGEST_WAIT
         seen = last.t_device if last is not None else 0.0
         while time.monotonic() < end:
             time.sleep(_POLL)
@@ -98,16 +99,15 @@ class UrArm(RobotDriver):
 
     def read(self, now: float) -> Reading:
         link, last = self._link, self._last
-        receive = link.receive
-        if receive is None:
-            raise ConnectionLost(f"{self.spec.name} is not open")
+        receive = self._find_receiver()
         t = receive.getTimestamp()
         if last is not None and t == last.t_device:
             if now - self._t_new > _SILENCE or not receive.isConnected():
-                self.engaged = False
+                self._lost, self.engaged = True, False
                 link.lose()
                 raise ConnectionLost.of(self.spec.name, SILENT)
             return last
+        self._lost = False
         self._t_new = now
         target = receive.getTargetQ()
         fault = self._judge(now, receive.getSafetyMode(), receive.getRuntimeState() == PLAYING, target)
@@ -137,7 +137,15 @@ class UrArm(RobotDriver):
         elif not link.starting:
             link.start()
 
+    def _find_receiver(self) -> Any:
+        if self._link.receive is None:
+            raise ConnectionLost(f"{self.spec.name} is not open")
+        return self._link.receive
+
     def write(self, setpoint: Setpoint) -> bool:
+        self._find_receiver()
+        if self._lost:
+            raise ConnectionLost.of(self.spec.name, SILENT)
         if not self._link.running or self._fault is not None:
             return False
         self._link.send(list(setpoint.q))
@@ -154,10 +162,6 @@ class UrArm(RobotDriver):
     def _judge(self, now: float, safety: int, playing: bool, target: list[float]) -> Fault | None:
         """Return the fault of this state; one of a session stays until recover()."""
         link = self._link
-        if safety != PROTECTIVE_STOP:
-            self._t_protective = inf
-        elif self._t_protective == inf:
-            self._t_protective = now
         fault = self._find_fault(safety, playing) or (self._judge_program(now, playing, target) if self.engaged else None)
         if not playing:
             link.note_stopped()
@@ -204,8 +208,8 @@ class UrArm(RobotDriver):
             RobotFault: Where the controller is not ready; ``code`` is the fault's.
             ConnectionLost: If it does not answer.
         """
-        receive = self._link.receive
-        if receive is None or not receive.isConnected():
+        receive = self._find_receiver()
+        if self._lost:
             raise ConnectionLost.of(self.spec.name, SILENT)
         if receive.getSafetyMode() == PROTECTIVE_STOP:
             self._unlock()
@@ -217,15 +221,13 @@ class UrArm(RobotDriver):
     def _unlock(self) -> None:
         """Unlock a protective stop. Raises RobotFault."""
         stop, receive = SAFETY[PROTECTIVE_STOP], self._link.receive
-        wait = self._t_protective + UNLOCK_AFTER - time.monotonic()
-        if wait > 0.0:
-            raise RobotFault(stop.cause, f"the controller unlocks it in {wait:.1f} s; then call recover()", code=stop.code)
+        refused = self._link.unlock()
         end = time.monotonic() + 1.0
-        unlocked = self._link.unlock()
-        while unlocked and receive.getSafetyMode() == PROTECTIVE_STOP and time.monotonic() < end:
+        while not refused and receive.getSafetyMode() == PROTECTIVE_STOP and time.monotonic() < end:
             time.sleep(0.01)
         if receive.getSafetyMode() == PROTECTIVE_STOP:
-            raise RobotFault(stop.cause, f"the controller did not unlock it; {stop.remedy}", code=stop.code)
+            cause = f"{stop.cause}; not unlocked{refused and f': {refused}'}"
+            raise RobotFault(cause, stop.remedy, code=stop.code)
 
 
 def find_tcp(spec: RobotSpec) -> list[float] | None:

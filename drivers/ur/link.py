@@ -90,6 +90,8 @@ class UrLink:
         self.longest_gap = 0.0
         """Longest time between two messages since the program started, s."""
         self.starting = False
+        self.version, self.rate, self.has_payload = "", 0.0, False
+        """Of the controller: PolyScope, cycles in a second, and whether it reports the payload."""
         self._target: list[float] | None = None
         self._wake = threading.Condition()
         self._jobs: list[Callable[[], None]] = []
@@ -109,9 +111,12 @@ class UrLink:
         try:
             self._dashboard = dashboard_client.DashboardClient(host)
             self._dashboard.connect()
-            version = [int(part) for part in self._dashboard.polyscopeVersion().split(".")[:2]]
+            self.version = str(self._dashboard.polyscopeVersion())
+            version = [int(part) for part in self.version.split(".")[:2]]
+            self.rate = 125.0 if version < [4, 0] else 500.0
             self._has_remote = version >= [5, 6]
-            variables = _VARIABLES + (_PAYLOAD if version >= [5, 6] or [3, 11] <= version < [4, 0] else [])
+            self.has_payload = self._has_remote or [3, 11] <= version < [4, 0]
+            variables = _VARIABLES + (_PAYLOAD if self.has_payload else [])
             upper = self.settings.upper_registers
             self.receive = rtde_receive.RTDEReceiveInterface(host, self.rate_hz, variables, False, upper)
             flags = rtde_control.RTDEControlInterface
@@ -148,21 +153,37 @@ class UrLink:
         """Ask soon whether the controller is in local control."""
         self._call(self._ask_remote)
 
-    def unlock(self) -> bool:
-        """Unlock a protective stop, and return whether the controller did. Blocks for at most 3 s."""
-        answers: list[bool] = []
-        done = threading.Event()
+    def unlock(self) -> str:
+        """Unlock a protective stop; return why that was not possible. Blocks for at most 3 s."""
+        answers: list[str] = []
 
         def unlock() -> None:
             try:
                 self._dashboard.closeSafetyPopup()
-                answers.append(bool(self._dashboard.unlockProtectiveStop()))
+                self._dashboard.unlockProtectiveStop()
+                answers.append("")
+            except RuntimeError as error:  # the controller's own words
+                answers.append(str(error))
+
+        self._finish(unlock)
+        return answers[0] if answers else "the dashboard does not answer"
+
+    def ask_local(self) -> bool:
+        """Return whether the controller is in local control. Blocks for at most 3 s."""
+        self._finish(self._ask_remote)
+        return self.local
+
+    def _finish(self, job: Callable[[], None]) -> None:
+        done = threading.Event()
+
+        def run() -> None:
+            try:
+                job()
             finally:
                 done.set()
 
-        self._call(unlock)
+        self._call(run)
         done.wait(3.0)
-        return answers == [True]
 
     def lose(self) -> None:
         """Note that the controller is silent: what it does is no longer known."""
@@ -250,6 +271,8 @@ class UrLink:
             self.running = self.refused is None
         finally:
             self.starting = False
+        self.version, self.rate, self.has_payload = "", 0.0, False
+        """Of the controller: PolyScope, cycles in a second, and whether it reports the payload."""
 
     def _start_program(self) -> Fault | None:
         """Start the control program with its watchdog; return why that was not possible."""

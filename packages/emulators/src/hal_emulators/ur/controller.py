@@ -12,7 +12,7 @@ from typing import Any
 
 from .motion import ROBOTS, TargetMotion, forward
 
-__all__ = ["Controller"]
+__all__ = ["POWER_OFF", "RUNNING", "Controller"]
 
 STOPPED, PLAYING = 1, 2
 """``runtime_state``."""
@@ -143,9 +143,9 @@ class Controller:
             return answers[line]
         act = {
             "unlock protective stop": self._unlock,
-            "power on": lambda: self._set_power(IDLE, "Powering on"),
-            "power off": lambda: self._set_power(POWER_OFF, "Powering off"),
-            "brake release": lambda: self._set_power(RUNNING, "Brake releasing"),
+            "power on": lambda: self.set_power(IDLE) or "Powering on",
+            "power off": lambda: self.set_power(POWER_OFF) or "Powering off",
+            "brake release": lambda: self.robot_mode == IDLE and self.set_power(RUNNING) or "Brake releasing",
             "stop": lambda: self.stop_program("dashboard") or "Stopped",
         }.get(line)
         return act() if act is not None else f"could not understand: '{line}'"
@@ -158,13 +158,12 @@ class Controller:
             self.note("protective stop unlocked")
         return "Protective stop releasing"
 
-    def _set_power(self, mode: int, answer: str) -> str:
-        if self.safety_mode == EMERGENCY_STOP or (mode == RUNNING and self.robot_mode == POWER_OFF):
-            return "Not possible now"
-        if mode != RUNNING:
-            self.stop_program("power")
-        self.robot_mode = mode
-        return answer
+    def set_power(self, mode: int) -> None:
+        """Switch the arm on, release its brakes, or switch it off. Not while the emergency stop is pressed."""
+        if self.safety_mode != EMERGENCY_STOP:
+            self.robot_mode = mode
+            if mode != RUNNING:
+                self.stop_program("power")
 
     # Each cycle.
 

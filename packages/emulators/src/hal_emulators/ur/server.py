@@ -18,7 +18,7 @@ from typing import Any
 
 from hal_emulators.control import CONTROL_PORT
 
-from .controller import Controller
+from .controller import POWER_OFF, RUNNING, Controller
 
 __all__ = ["COMMANDS", "UrServer"]
 
@@ -42,7 +42,7 @@ COMMANDS = {
     "protective": ("", "protective stop"),
     "estop": ("on|off", "press or release the emergency stop; then: power"),
     "safeguard": ("on|off", "interrupt or close the safeguard input"),
-    "power": ("", "switch the arm on and release its brakes"),
+    "power": ("on|off", "switch the arm on and release its brakes, or off"),
     "remote": ("on|off", "remote or local control"),
     "slider": ("SHARE", "the speed slider, 0 to 1"),
     "program": ("[NAME]", "run another program, or stop the one that is running"),
@@ -326,7 +326,7 @@ class UrServer:
             "protective": lambda: controller.stop_protective("C153: requested here"),
             "estop": lambda: controller.stop_emergency(_switch(values[0])),
             "safeguard": lambda: controller.set_safeguard(_switch(values[0])),
-            "power": lambda: setattr(controller, "robot_mode", 7),
+            "power": lambda: controller.set_power(RUNNING if _switch(values[0]) else POWER_OFF),
             "remote": lambda: controller.set_remote(_switch(values[0])),
             "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
             "program": lambda: controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant"),
