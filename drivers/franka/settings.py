@@ -24,6 +24,8 @@ _NO_ADDRESS = (
     "is missing: the robot's address, as Desk shows it; pass it with --set KEY=ADDRESS (overrides= of hal.open), "
     "KEY as above, or write it into a rig file of your own"
 )
+
+
 def _check_each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
     """Check for as many numbers as there are ranges (lowest, highest), each within its own."""
 

@@ -25,7 +25,6 @@ from .faults import (
     RUNNING,
     SAFETY,
     SILENT,
-    UNLOCK_AFTER,
     WATCHDOG,
     mode_fault,
     scaling_fault,
@@ -162,7 +161,9 @@ class UrArm(RobotDriver):
     def _judge(self, now: float, safety: int, playing: bool, target: list[float]) -> Fault | None:
         """Return the fault of this state; one of a session stays until recover()."""
         link = self._link
-        fault = self._find_fault(safety, playing) or (self._judge_program(now, playing, target) if self.engaged else None)
+        fault = self._find_fault(safety, playing) or (
+            self._judge_program(now, playing, target) if self.engaged else None
+        )
         if not playing:
             link.note_stopped()
         if self.engaged and fault is not None:
@@ -231,7 +232,7 @@ class UrArm(RobotDriver):
 
 
 def find_tcp(spec: RobotSpec) -> list[float] | None:
-    """Return the model's tcp in the frame of the flange, m and a rotation vector, rad; None if it is on another link."""
+    """Return the model's tcp in the flange's frame, m and a rotation vector (rad); None if it is on another link."""
     k = spec.kinematics
     if k.tcp_link != FLANGE:
         return None

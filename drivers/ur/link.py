@@ -1,7 +1,7 @@
 """Connection to a UR controller through ur_rtde, and the thread that makes every call which may block.
 
-ur_rtde's constructors keep Python's lock while they wait, so they are called only after the ports have answered, and only
-in :meth:`UrLink.open`. Its other calls release the lock. Its objects are never deleted, as that keeps the lock, too.
+ur_rtde's constructors keep Python's lock while they wait, so they are called in :meth:`UrLink.open` only, once the ports
+have answered. Its other calls release the lock. Its objects are never deleted, as that keeps the lock, too.
 """
 
 from __future__ import annotations
@@ -243,9 +243,7 @@ class UrLink:
     def _serve(self, control: Any, target: list[float] | None) -> None:
         if target is None:
             control.kickWatchdog()
-        elif control.servoJ(
-            target, 0.0, 0.0, 1.0 / self.rate_hz, self.settings.lookahead_time, self.settings.gain
-        ):
+        elif control.servoJ(target, 0.0, 0.0, 1.0 / self.rate_hz, self.settings.lookahead_time, self.settings.gain):
             self.sent = target
 
     def _reconnect(self, receive: Any, control: Any) -> None:

@@ -17,7 +17,7 @@ from hal.kinematics.arm import Kinematics
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 
-from .arm import FLANGE, find_tcp
+from .arm import find_tcp
 from .faults import LOCAL, NO_CONTROLLER, OTHER_PROGRAM, PLAYING, RUNNING, SAFETY, mode_fault, scaling_fault
 from .link import UrLink, probe
 from .settings import UrSettings
@@ -86,9 +86,9 @@ def _check_tcp(spec: RobotSpec, settings: UrSettings, receive: Any) -> CheckResu
     if distance <= _FAR and rotation <= _TURNED:
         return CheckResult("tcp", "ok", found)
     sets = settings.set_tcp and find_tcp(spec) is not None
-    remedy = "the model's is set when a session opens" if sets else "set it in the installation"
-    remedy += "; what stays is the factory calibration, which this driver does not use: expect that error of poses"
-    return CheckResult("tcp", "warn", found, remedy if spec.kinematics.tcp_link == FLANGE else f"{remedy}; see docs/ur.md")
+    remedy = "the model's is set when a session opens" if sets else "set the model's in the installation"
+    remedy += "; what stays then is the factory calibration, which this driver does not use: poses have that error"
+    return CheckResult("tcp", "warn", found, remedy)
 
 
 def _check_payload(settings: UrSettings, link: UrLink) -> CheckResult:
@@ -102,7 +102,8 @@ def _check_payload(settings: UrSettings, link: UrLink) -> CheckResult:
     if abs(load.mass - mass) < 0.01 and max(abs(a - b) for a, b in zip(load.com, com, strict=True)) < 0.002:
         return CheckResult("payload", "ok", f"{found}, as the rig has it")
     wanted = f"the rig has {load.mass:g} kg at {list(load.com)} m"
-    return CheckResult("payload", "warn", f"{found}; {wanted}", "the rig's is set when a session opens; correct the wrong one")
+    remedy = "the rig's is set when a session opens; correct the wrong one"
+    return CheckResult("payload", "warn", f"{found}; {wanted}", remedy)
 
 
 def _check_states(spec: RobotSpec, link: UrLink, duration: float) -> CheckResult:

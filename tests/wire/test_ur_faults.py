@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from math import inf
 
 import pytest
-from hal_emulators.control import EmulatorControl
 
 import hal
+from hal_emulators.control import EmulatorControl
 
 from .ur_kit import UrEmulator
 
@@ -82,11 +82,13 @@ def test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover(
     arm, (cause, end) = rig.robots["arm"], FAULTS[name]
     code, named = name.partition(" ")[0], inf
     arm.move_to(arm.home, unattended=True, speed=0.3)
-    with pytest.raises((hal.RobotFault, hal.MotionStopped, hal.ConnectionLost)), arm.control(rate_hz=50, unattended=True) as control:
+    with (
+        pytest.raises(hal.HalError),
+        arm.control(rate_hz=50, unattended=True) as control,
+    ):
         for tick in rig.clock.rate(50):
             control.send(hal.JointVelocity([0, 0, 0, 0.2, 0, 0]))
-            if tick.elapsed > 0.4 and named == inf:
-                assert max(emulator.status()["dq"]) > 0.1, "nothing moved"
+            if named == inf and max(emulator.status()["dq"]) > 0.1:
                 emulator.control.send(cause)
                 began = time.monotonic()
                 wait_code(arm, code)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+
 from hal_emulators.control import EmulatorControl
 
 from .franka_kit import END_LIMIT, free_host

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from hal.config import load
-from hal.drivers.franka.limits import FER, FR3
 from hal.config.schema import is_own_host
+from hal.drivers.franka.limits import FER, FR3
 from hal.drivers.franka.settings import ArmSettings, HandSettings, check_arm, check_hand
 from hal.errors import ConfigError
 from hal.specs import GripperSpec, LimitsSpec, RobotSpec

@@ -22,8 +22,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
     parser = argparse.ArgumentParser(
         prog="hal emulate ur",
-        description="Emulates the controller of a Universal Robots arm for ur_rtde. What UR does not publish is assumed; "
-        "it proves nothing about a real arm.",
+        description="Emulates the controller of a Universal Robots arm for ur_rtde. What UR does not publish is "
+        "assumed; it proves nothing about a real arm.",
         epilog="commands of the control port, for example `echo protective | nc HOST 1339`:\n" + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -32,11 +32,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--host", default="127.0.0.1", type=_loopback, help="address to listen on; the ports are fixed (%(default)s)")
     add("--q", type=float, nargs=6, default=HOME, metavar="RAD", help="joint positions at the start")
     add("--payload", type=float, default=0.0, metavar="KG", help="payload of the installation")
-    add("--tcp", type=float, nargs=6, default=(0.0,) * 6, metavar="M", help="tcp of the installation: m, rotation vector")
+    add(
+        "--tcp",
+        type=float,
+        nargs=6,
+        default=(0.0,) * 6,
+        metavar="M",
+        help="tcp of the installation: m, rotation vector",
+    )
     add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
     options = parser.parse_args(arguments)
     try:
-        server = UrServer(options.host, Controller(options.robot, options.q, options.payload, options.tcp), options.seed)
+        server = UrServer(
+            options.host, Controller(options.robot, options.q, options.payload, options.tcp), options.seed
+        )
     except OSError as error:
         print(f"error: {options.host}: {error.strerror}", file=sys.stderr)
         return 1

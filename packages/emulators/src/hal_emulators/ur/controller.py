@@ -7,6 +7,7 @@ the handshake is played.
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -98,7 +99,7 @@ class Controller:
         """Stop with a protective stop; it ends the program."""
         if self.safety_mode == NORMAL:
             self.note(f"protective stop: {why}")
-            self.safety_mode, self._t_protective = PROTECTIVE_STOP, self.now
+            self.safety_mode, self._t_protective = PROTECTIVE_STOP, time.monotonic()
             self.stop_program("protective stop")
             self.motion.stop(_PROTECTIVE_DECELERATION)
 
@@ -145,13 +146,13 @@ class Controller:
             "unlock protective stop": self._unlock,
             "power on": lambda: self.set_power(IDLE) or "Powering on",
             "power off": lambda: self.set_power(POWER_OFF) or "Powering off",
-            "brake release": lambda: self.robot_mode == IDLE and self.set_power(RUNNING) or "Brake releasing",
+            "brake release": lambda: (self.robot_mode == IDLE and self.set_power(RUNNING)) or "Brake releasing",
             "stop": lambda: self.stop_program("dashboard") or "Stopped",
         }.get(line)
         return act() if act is not None else f"could not understand: '{line}'"
 
     def _unlock(self) -> str:
-        if self.safety_mode == PROTECTIVE_STOP and self.now - self._t_protective < _UNLOCK:
+        if self.safety_mode == PROTECTIVE_STOP and time.monotonic() - self._t_protective < _UNLOCK:
             return "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop"
         if self.safety_mode == PROTECTIVE_STOP:
             self.safety_mode = NORMAL

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import random
 import selectors
 import socket
@@ -23,18 +24,25 @@ from .controller import POWER_OFF, RUNNING, Controller
 __all__ = ["COMMANDS", "UrServer"]
 
 RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
+_PRIORITY = 40
+"""Of this process among SCHED_FIFO ones; a host has 50."""
 _LONGEST = 1 << 20
 """Most bytes that a client may send without a whole message."""
 _FORMATS = {"VECTOR6D": "6d", "DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q"}
 _FORMATS |= {"VECTOR6INT32": "6i", "VECTOR3D": "3d", "UINT8": "B", "BOOL": "?"}
 _VECTORS = frozenset(
-    "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current joint_control_output "
-    "actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed joint_temperatures "
-    "actual_joint_voltage ft_raw_wrench payload_inertia external_force_torque tcp_offset".split()
+    (
+        "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current "
+        "joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose "
+        "target_TCP_speed joint_temperatures actual_joint_voltage ft_raw_wrench payload_inertia "
+        "external_force_torque tcp_offset "
+    ).split()
 )
 _UNSIGNED = frozenset(
-    "robot_status_bits safety_status_bits runtime_state output_bit_registers0_to_31 output_bit_registers32_to_63 "
-    "speed_slider_mask".split()
+    (
+        "robot_status_bits safety_status_bits runtime_state output_bit_registers0_to_31 "
+        "output_bit_registers32_to_63 speed_slider_mask "
+    ).split()
 )
 _UNSET = {"6d": (0.0,) * 6, "3d": (0.0,) * 3, "6i": (0,) * 6}
 
@@ -150,6 +158,8 @@ class UrServer:
 
     def run(self) -> None:
         """Serve until :meth:`stop` is called."""
+        with contextlib.suppress(AttributeError, OSError):  # Linux only, and only where it is allowed
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
         due = time.monotonic()
         while self._running:
             due += self.controller.dt
@@ -329,7 +339,9 @@ class UrServer:
             "power": lambda: controller.set_power(RUNNING if _switch(values[0]) else POWER_OFF),
             "remote": lambda: controller.set_remote(_switch(values[0])),
             "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
-            "program": lambda: controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant"),
+            "program": lambda: (
+                controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant")
+            ),
             "lose": lambda: setattr(self, "_lose", _number(values[0], 0.0, 1.0)),
             "late": lambda: setattr(self, "_delay", _number(values[0], 0.0, 10.0)),
             "silence": lambda: setattr(self, "_silent_until", time.monotonic() + _number(values[0], 0.0, 1e9)),
