@@ -1,7 +1,7 @@
 """Connection to a UR controller through ur_rtde, and the thread that makes every call which may block.
 
-ur_rtde's constructors keep Python's lock while they wait, so they are called in :meth:`UrLink.open` only, once the ports
-have answered. Its other calls release the lock. Its objects are never deleted, as that keeps the lock, too.
+ur_rtde's constructors keep Python's lock while they wait, so they are called in :meth:`UrLink.open` only, once the
+ports have answered. Its other calls release the lock. Its objects are never deleted, as that keeps the lock, too.
 """
 
 from __future__ import annotations

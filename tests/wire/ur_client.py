@@ -39,6 +39,7 @@ control.speedJ([0.0, 0.0, 0.0, 0.3, 0.0, 0.0], 2.0)
 time.sleep(0.6)
 done["speed"] = receive.getActualQd()[3]
 control.speedStop()
+time.sleep(0.1)
 done["still"] = [max(map(abs, receive.getActualQd())), control.isProgramRunning()]
 jump = receive.getActualQ()
 for _ in range(20):  # a target 0.5 rad away is no path

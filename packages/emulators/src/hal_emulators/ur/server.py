@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import selectors
 import socket
 import struct
@@ -30,20 +31,11 @@ _LONGEST = 1 << 20
 """Most bytes that a client may send without a whole message."""
 _FORMATS = {"VECTOR6D": "6d", "DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q"}
 _FORMATS |= {"VECTOR6INT32": "6i", "VECTOR3D": "3d", "UINT8": "B", "BOOL": "?"}
-_VECTORS = frozenset(
-    (
-        "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current "
-        "joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose "
-        "target_TCP_speed joint_temperatures actual_joint_voltage ft_raw_wrench payload_inertia "
-        "external_force_torque tcp_offset "
-    ).split()
+_VECTORS = re.compile(
+    "(target|actual)_(q|qd|qdd|current|moment|TCP_pose|TCP_speed|TCP_force|joint_voltage)|joint_control_output|"
+    "joint_temperatures|ft_raw_wrench|payload_inertia|external_force_torque|tcp_offset"
 )
-_UNSIGNED = frozenset(
-    (
-        "robot_status_bits safety_status_bits runtime_state output_bit_registers0_to_31 "
-        "output_bit_registers32_to_63 speed_slider_mask "
-    ).split()
-)
+_UNSIGNED = re.compile("(robot|safety)_status_bits|runtime_state|output_bit_registers.*|speed_slider_mask")
 _UNSET = {"6d": (0.0,) * 6, "3d": (0.0,) * 3, "6i": (0,) * 6}
 
 COMMANDS = {
@@ -66,13 +58,13 @@ COMMANDS = {
 
 def _type_of(name: str) -> str:
     """Return the type of an RTDE variable."""
-    if name in _VECTORS:
+    if _VECTORS.fullmatch(name):
         return "VECTOR6D"
     if name == "joint_mode":
         return "VECTOR6INT32"
     if name in ("actual_tool_accelerometer", "payload_cog"):
         return "VECTOR3D"
-    if name in _UNSIGNED:
+    if _UNSIGNED.fullmatch(name):
         return "UINT32"
     if name in ("actual_digital_input_bits", "actual_digital_output_bits"):
         return "UINT64"
