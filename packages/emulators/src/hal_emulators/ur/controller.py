@@ -142,14 +142,23 @@ class Controller:
         }
         if line in answers:
             return answers[line]
-        act = {
-            "unlock protective stop": self._unlock,
-            "power on": lambda: self.set_power(IDLE) or "Powering on",
-            "power off": lambda: self.set_power(POWER_OFF) or "Powering off",
-            "brake release": lambda: (self.robot_mode == IDLE and self.set_power(RUNNING)) or "Brake releasing",
-            "stop": lambda: self.stop_program("dashboard") or "Stopped",
-        }.get(line)
-        return act() if act is not None else f"could not understand: '{line}'"
+        if line == "unlock protective stop":
+            return self._unlock()
+        act: dict[str, tuple[Callable[[], None], str]] = {
+            "power on": (lambda: self.set_power(IDLE), "Powering on"),
+            "power off": (lambda: self.set_power(POWER_OFF), "Powering off"),
+            "brake release": (self._release_brakes, "Brake releasing"),
+            "stop": (lambda: self.stop_program("dashboard"), "Stopped"),
+        }
+        if line not in act:
+            return f"could not understand: '{line}'"
+        call, answer = act[line]
+        call()
+        return answer
+
+    def _release_brakes(self) -> None:
+        if self.robot_mode == IDLE:
+            self.set_power(RUNNING)
 
     def _unlock(self) -> str:
         if self.safety_mode == PROTECTIVE_STOP and time.monotonic() - self._t_protective < _UNLOCK:
