@@ -29,13 +29,17 @@ from .faults import (
     mode_fault,
     scaling_fault,
 )
-from .link import WATCHDOG_HZ, UrLink
+from .link import UrLink
 from .settings import UrSettings
 
 _LONGEST_WAIT = 0.02
 """s"""
 _SILENCE = 0.12
 """Time without a new state after which the connection counts as lost, s."""
+_PAUSED = 0.06
+"""Time between two calls of read() from which a silence is this process's own, s."""
+_RECENT = 1.0
+"""Time within which a silence of this computer explains the end of a program, s."""
 _EXPLAIN = 0.05
 """Longest time to find out why a program ended, s."""
 _FULL = 0.995
@@ -65,7 +69,8 @@ class UrArm(RobotDriver):
         self._fault: Fault | None = None
         """Fault of a session, until recover()."""
         self._last: Reading | None = None
-        self._t_new, self._lost = -inf, False
+        self._t_new = self._t_read = -inf
+        self._lost = False
         self._t_ended = inf
         """Since when the control program is over, s."""
 
@@ -99,6 +104,9 @@ class UrArm(RobotDriver):
     def read(self, now: float) -> Reading:
         link, last = self._link, self._last
         receive = self._find_receiver()
+        if now - self._t_read > _PAUSED:  # this process did not run: what is new has yet to be received
+            self._t_new = now
+        self._t_read = now
         t = receive.getTimestamp()
         if last is not None and t == last.t_device:
             if now - self._t_new > _SILENCE or not receive.isConnected():
@@ -200,7 +208,7 @@ class UrArm(RobotDriver):
         self._t_ended = inf
         if link.local:
             return LOCAL
-        return WATCHDOG if link.longest_gap > 0.7 / WATCHDOG_HZ else PROGRAM_STOPPED
+        return WATCHDOG if now - link.t_late < _RECENT else PROGRAM_STOPPED
 
     def recover(self) -> None:
         """Clear a fault; unlock a protective stop. Blocks for at most 4 s.

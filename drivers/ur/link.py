@@ -89,6 +89,8 @@ class UrLink:
         """The newest set-point that was sent, rad; None before the first one of a program."""
         self.longest_gap = 0.0
         """Longest time between two messages since the program started, s."""
+        self.t_late = 0.0
+        """When this computer was last silent for nearly as long as the watchdog allows, s."""
         self.starting = False
         self.version, self.rate, self.has_payload = "", 0.0, False
         """Of the controller: PolyScope, cycles in a second, and whether it reports the payload."""
@@ -187,7 +189,7 @@ class UrLink:
 
     def lose(self) -> None:
         """Note that the controller is silent: what it does is no longer known."""
-        self.running, self._target = False, None
+        self.running, self.starting, self._target = False, False, None
 
     def close(self) -> None:
         """End the control program, and disconnect. Idempotent."""
@@ -211,34 +213,35 @@ class UrLink:
 
     def _run(self) -> None:
         receive, control = self.receive, self._control
-        last = 0.0
+        last = time.monotonic()
         while not self._closing:
             with self._wake:
                 if not self._jobs and self._target is None:
                     self._wake.wait(_KICK)
                 target, self._target = self._target, None
                 jobs, self._jobs = self._jobs, []
+            gap = time.monotonic() - last
+            if gap > 0.7 / WATCHDOG_HZ:
+                self.t_late = time.monotonic()
+            self.longest_gap = max(self.longest_gap, gap)
             try:
                 if not receive.isConnected() or not control.isConnected():
                     self.lose()
                     self._reconnect(receive, control)
-                    continue
-                for job in jobs:
-                    job()
-                if jobs and self.sent is None:
-                    last = time.monotonic()
-                if self.running:
-                    now = time.monotonic()
-                    self.longest_gap = max(self.longest_gap, now - last)
-                    last = now
+                elif jobs:
+                    for job in jobs:
+                        job()
+                elif self.running:
                     self._serve(control, target)
             except RuntimeError as error:
                 print(f"{self.name}: ur_rtde: {error}", file=sys.stderr)
                 self.lose()
-        for end in (control.stopScript if self._ours else None, control.disconnect, receive.disconnect):
-            if end is not None:
-                with contextlib.suppress(RuntimeError):
-                    end()
+            last = time.monotonic()
+        with contextlib.suppress(RuntimeError):
+            if self._ours and control.isConnected():
+                control.stopScript()
+            control.disconnect()
+            receive.disconnect()
 
     def _serve(self, control: Any, target: list[float] | None) -> None:
         if target is None:
@@ -269,8 +272,6 @@ class UrLink:
             self.running = self.refused is None
         finally:
             self.starting = False
-        self.version, self.rate, self.has_payload = "", 0.0, False
-        """Of the controller: PolyScope, cycles in a second, and whether it reports the payload."""
 
     def _start_program(self) -> Fault | None:
         """Start the control program with its watchdog; return why that was not possible."""
@@ -289,5 +290,7 @@ class UrLink:
             time.sleep(0.002)
         ready = control.setWatchdog(WATCHDOG_HZ)
         ready = ready and (self.tcp is None or control.setTcp(self.tcp))
-        ready = ready and (load is None or control.setPayload(load.mass, list(load.com)))
+        if load is not None and ready:
+            com = load.com if any(load.com) else (0.0, 0.0, 1e-6)  # for zeros ur_rtde keeps the present centre
+            ready = control.setPayload(load.mass, list(com))
         return None if ready else NOT_STARTED
