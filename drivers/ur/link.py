@@ -123,6 +123,7 @@ class UrLink:
             self.receive = rtde_receive.RTDEReceiveInterface(host, self.rate_hz, variables, False, upper)
             flags = rtde_control.RTDEControlInterface
             chosen = int(flags.FLAG_NO_WAIT) | int(flags.FLAG_DISABLE_REMOTE_CONTROL_CHECK)  # no program is started
+            chosen |= int(flags.FLAG_NO_EXT_FT)  # an input that is not used, and that another client may have
             chosen |= int(flags.FLAG_UPPER_RANGE_REGISTERS) if upper else 0
             self._control = rtde_control.RTDEControlInterface(host, self.rate_hz, chosen)
         except (RuntimeError, ValueError) as error:  # all that ur_rtde raises

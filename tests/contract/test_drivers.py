@@ -125,6 +125,7 @@ def ur5e() -> Iterator[UR5e]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone  # in real time
 class TestEmulatedUr5e(
     RobotContract,
     left_out={

@@ -127,10 +127,19 @@ def test_an_arm_that_runs_another_program_opens_no_session(emulator: UrEmulator)
         other.close()
 
 
-def test_registers_of_another_client_are_named(rig: hal.Rig, emulator: UrEmulator) -> None:
-    from hal.config import load
-    from hal.preflight import preflight
+def test_registers_of_another_client_are_named_and_can_be_avoided() -> None:
+    other = UrEmulator()
+    import rtde_control
 
-    plan = load(emulator.rig()).resolve()
-    results = {result.name: result for result in preflight(plan, 0.2, machine=False)}
-    assert any("another program uses" in r.found or "in use" in r.name for r in results.values()), results
+    client = rtde_control.RTDEControlInterface(other.host, 500.0, rtde_control.RTDEControlInterface.FLAG_UPLOAD_SCRIPT)
+    try:
+        with pytest.raises(hal.ConnectionLost) as refused:
+            hal.open(other.rig())
+        assert refused.value.code == "REGISTERS_TAKEN"
+        client.stopScript()
+        with hal.open(other.rig(upper_registers=True)) as rig:
+            arm = rig.robots["arm"]
+            assert abs(arm.move_to(arm.home + 0.05, unattended=True).q - arm.home - 0.05).max() < 2e-3
+    finally:
+        client.disconnect()
+        other.close()
