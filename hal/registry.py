@@ -43,6 +43,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "pybullet": "hal.drivers.pybullet:DRIVER",
         "realsense": "hal.drivers.realsense:DRIVER",
         "terminal": "hal.drivers.terminal:DRIVER",
+        "ur": "hal.drivers.ur:DRIVER",
         "v4l2": "hal.drivers.webcam:V4L2",
         "video": "hal.drivers.webcam:VIDEO",
         "viser": "hal.drivers.viser:DRIVER",

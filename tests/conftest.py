@@ -163,7 +163,9 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, A
     return _strict((yield))
 
 
-WITHOUT_WHEEL = tuple(name for name, last in {"pybullet": (3, 11), "pylibfranka": (3, 12)}.items() if last < PYTHON)
+WITHOUT_WHEEL = tuple(
+    name for name, last in {"pybullet": (3, 11), "pylibfranka": (3, 12), "ur_rtde": (3, 13)}.items() if last < PYTHON
+)
 """Libraries that this version of Python has no wheels of: tests may skip that name one of them in their reason."""
 
 

@@ -12,7 +12,7 @@ DRIVER = DriverSpec(
         "robot": "hal.drivers.franka.settings:check_arm",
         "gripper": "hal.drivers.franka.settings:check_hand",
     },
-    emulated="hal.drivers.franka.settings:is_emulated",
+    emulated="hal.config.schema:is_own_host",
     preflight="hal.drivers.franka.preflight:check",
     own_process=frozenset({"gripper"}),
     shared_options=("host",),

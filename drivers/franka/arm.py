@@ -17,6 +17,7 @@ from math import inf
 from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
+from hal.config.schema import is_own_host
 from hal.driver import Reading, RobotDriver, Setpoint
 from hal.dynamics import Dynamics
 from hal.errors import ConnectionLost, DriverMissing, Fault, HalError, NotSupported, RobotFault
@@ -31,7 +32,7 @@ from .faults import ARM_PORT, fault_of, fault_of_exception, is_connection_lost
 from .flags import FLAGS
 from .link import ArmLink, ArmMode, ArmSample, StreamKind
 from .network import PortState, lock_arm, probe_port, resolve_host
-from .settings import ArmSettings, is_emulated
+from .settings import ArmSettings
 
 _RECOVERY_TIMEOUT = 3.0
 """Longest time until the robot is idle after a recovery, s."""
@@ -423,7 +424,7 @@ class ArmConnection:
         if resolve_host(host) is None:
             raise self.error(self.explain(RuntimeError("Host not found")))
         port = probe_port(host, ARM_PORT, timeout)
-        if port is PortState.REFUSED and is_emulated({"host": host}):
+        if port is PortState.REFUSED and is_own_host({"host": host}):
             cause = f"no emulator listens at {host}, port {ARM_PORT}"
             raise self.error(Fault("refused", cause, _START_EMULATOR.format(host)))
         if port is not PortState.OPEN:

@@ -6,9 +6,7 @@ physically possible. Nothing here imports the vendor's libraries.
 
 from __future__ import annotations
 
-import ipaddress
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,7 +14,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from hal.config.files import DeviceSettings
 from hal.config.models import UNITS
-from hal.config.schema import Offset, PoseConfig, Size, Strict, ValueProblem, describe, is_number
+from hal.config.schema import Host, Offset, PoseConfig, Size, Strict, ValueProblem, describe, is_number
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import Floats, GripperSpec, RobotSpec
 
@@ -26,24 +24,6 @@ _NO_ADDRESS = (
     "is missing: the robot's address, as Desk shows it; pass it with --set KEY=ADDRESS (overrides= of hal.open), "
     "KEY as above, or write it into a rig file of your own"
 )
-_LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
-
-
-def _host(value: Any) -> str:
-    """An IPv4 address or a host name."""
-    advice = "must be the robot's address, for example 172.16.0.2, without scheme and port"
-    if not isinstance(value, str):
-        raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address")
-    text = value.strip()
-    labels = text.removesuffix(".").split(".")
-    if labels[-1].isdecimal():  # no host name ends in a number
-        try:
-            return str(ipaddress.IPv4Address(text))
-        except ValueError:
-            raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address") from None
-    if not all(_LABEL.fullmatch(label) for label in labels):
-        raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address")
-    return text
 
 
 def _check_each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
@@ -64,7 +44,6 @@ def _check_each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
 
 _ANY = 1e4
 """Largest threshold, Nm or N. One beyond every force of the arm switches the detection off."""
-Host = Annotated[str, BeforeValidator(_host)]
 Torques = Annotated[Floats, _check_each("Nm, one for each joint", *[(0.0, _ANY)] * 7)]
 Forces = Annotated[Floats, _check_each("x, y, z in N, then roll, pitch, yaw in Nm", *[(0.0, _ANY)] * 6)]
 JointStiffness = Annotated[Floats, _check_each("Nm/rad, one for each joint", *[(0.0, 14250.0)] * 7)]
@@ -184,15 +163,6 @@ class HandSettings(DeviceSettings):
     host: Host
     tolerance: Size = 0.002
     """Largest distance from the target width at which the fingers count as arrived, m."""
-
-
-def is_emulated(options: Mapping[str, Any]) -> bool:
-    """Return whether the host in these options is this computer, so that the robot can only be an emulator."""
-    host = str(options.get("host", "")).strip().removesuffix(".").lower()
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def libraries(spec: RobotSpec | GripperSpec) -> tuple[str, ...]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import ipaddress
 import math
+import re
 import typing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -196,8 +199,38 @@ def _check_length(direction: tuple[float, ...]) -> tuple[float, ...]:
     return direction
 
 
+_LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
+
+
+def _host(value: Any) -> str:
+    """An IPv4 address or a host name."""
+    advice = "must be the robot's address, for example 172.16.0.2, without scheme and port"
+    if not isinstance(value, str):
+        raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address")
+    text = value.strip()
+    labels = text.removesuffix(".").split(".")
+    if labels[-1].isdecimal():  # no host name ends in a number
+        try:
+            return str(ipaddress.IPv4Address(text))
+        except ValueError:
+            raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address") from None
+    if not all(_LABEL.fullmatch(label) for label in labels):
+        raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address")
+    return text
+
+
+def is_own_host(options: Mapping[str, Any]) -> bool:
+    """Return whether ``host`` in a device's options is this computer, so that the device can only be an emulator."""
+    host = str(options.get("host", "")).strip().removesuffix(".").lower()
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(pattern=r"^_?[A-Za-z][A-Za-z0-9_-]*$")]
+Host = Annotated[str, BeforeValidator(_host)]
 Pixels = Annotated[int, Field(strict=True, gt=0, le=16384)]
 
 # Every number of a rig, a model, an object or a mapping is one of these. The ranges include everything that fits on one

@@ -41,6 +41,13 @@ class Apart(RobotDriver):
     def _call(self, method: str, *arguments: Any, **knobs: Any) -> Any:
         return self._child.request(method, {"arguments": arguments, "knobs": knobs}, LIMIT)
 
+    @property
+    def engaged(self) -> bool:  # type: ignore[override]
+        return bool(self._call("engaged"))
+
+    def engage(self) -> None:
+        self._call("engage")
+
     def open(self) -> None:
         self._call("open")
 
@@ -51,8 +58,9 @@ class Apart(RobotDriver):
         reading = Reading(*self._call("read", now))
         return reading if reading.fault is None else reading._replace(fault=Fault(*reading.fault))
 
-    def write(self, setpoint: Setpoint) -> None:
-        self._call("write", setpoint)
+    def write(self, setpoint: Setpoint) -> bool | None:
+        taken: bool | None = self._call("write", setpoint)
+        return taken
 
     def halt(self) -> None:
         self._call("halt")
@@ -93,7 +101,8 @@ def main(channel: Channel, memories: object, config: Mapping[str, Any]) -> None:
             arguments = request["params"]["arguments"]
             if request["method"] == "write":
                 arguments = [Setpoint(*arguments[0])]
-            result = getattr(driver, request["method"])(*arguments, **request["params"]["knobs"])
+            attribute = getattr(driver, request["method"])
+            result = attribute(*arguments, **request["params"]["knobs"]) if callable(attribute) else attribute
             channel.send({"id": request["id"], "result": _plain(result)})
         except Exception as error:
             channel.send({"id": request["id"], "error": pack_error(error)})

@@ -44,6 +44,7 @@ from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
 from .pads import mock_pad, playback_pad, terminal_steps, web_pad
+from .urs import UR5e
 from .webcams import network_camera, video_file, webcam
 
 NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simulation: there is no link")
@@ -113,6 +114,31 @@ class TestEmulatedFr3(
     @pytest.fixture
     def bench(self, fr3: FR3) -> Iterator[RobotBench]:
         with fr3.arm() as bench:
+            yield bench
+
+
+@pytest.fixture(scope="module")
+def ur5e() -> Iterator[UR5e]:
+    """An emulated UR5e."""
+    robot = UR5e()
+    yield robot
+    robot.close()
+
+
+@pytest.mark.slow
+@pytest.mark.alone  # in real time
+class TestEmulatedUr5e(
+    RobotContract,
+    left_out={
+        "freeze": "a controller that is silent for 0.12 s counts as lost: tests/wire/test_ur_faults.py",
+        "torque": "servoj takes positions",
+    },
+):
+    """The driver and ur_rtde against the emulator, in real time."""
+
+    @pytest.fixture
+    def bench(self, ur5e: UR5e) -> Iterator[RobotBench]:
+        with ur5e.arm() as bench:
             yield bench
 
 

@@ -34,6 +34,11 @@ ELSEWHERE = {
     "a Franka ends the motion": (f"{WIRE}franka_faults.py", f"{WIRE}franka_stops.py"),
     "a Franka's set-points or states": (f"{WIRE}franka_tour.py::test_packets_that_are_lost_end_no_motion",),
     "the app of a Franka is killed": (f"{WIRE}franka_ends.py::test_an_app_is_killed_while_the_robot_hangs",),
+    "a UR stops": (f"{WIRE}ur_faults.py::test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover",),
+    "the host of a UR dies": (
+        f"{WIRE}ur_rig.py::test_the_controller_stops_its_program_when_the_host_is_killed",
+        f"{WIRE}ur_rig.py::test_the_arm_stands_150_ms_after_the_last_message",
+    ),
     "the host of an arm with Damiao": (f"{WIRE}can_gravity.py::test_an_arm_without_its_program_sinks_slowly",),
     "an arm with Damiao motors is closed": (
         f"{CAN}close_lowers_a_raised_arm_slowly_and_never_drops_it",

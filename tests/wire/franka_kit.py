@@ -19,7 +19,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,8 @@ END_LIMIT = 15.0
 _hosts = itertools.cycle(range(1, 251))
 
 
-def free_host() -> str:
-    """Return a loopback address with free Franka ports, which this process has not used yet, and no other one uses.
+def free_host(ports: Sequence[int] = PORTS) -> str:
+    """Return a loopback address where these ports are free, which this process has not used yet, and no other one uses.
 
     A new address each time: the process of an arm that a test left behind may still hold the lock on the old one.
     """
@@ -44,7 +44,7 @@ def free_host() -> str:
     for last in itertools.islice(_hosts, 250):
         host = f"{block}.{last}"
         with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
-            for port in PORTS:
+            for port in ports:
                 listener = stack.enter_context(socket.socket())
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 listener.bind((host, port))

@@ -13,7 +13,7 @@ import hal
 from hal.apps._display import banner, list_devices
 from hal.config import load
 from hal.config.data_files import find_data, list_data
-from hal.drivers.franka.settings import is_emulated
+from hal.config.schema import is_own_host
 
 
 def robot_line(config: Any, **arguments: Any) -> str:
@@ -37,7 +37,7 @@ def test_an_arm_is_called_what_it_is(config: str, sim: bool | None, words: str) 
 def test_a_built_in_rig_names_no_robot_that_is_not_the_users(rig: str) -> None:
     written = yaml.safe_load(find_data("config", f"{rig}.yaml").read_text())
     for arm in written["robots"].values():
-        assert is_emulated({"host": arm.get("real", {}).get("host", "127.0.0.1")})
+        assert is_own_host({"host": arm.get("real", {}).get("host", "127.0.0.1")})
     if rig in ("franka", "panda_table"):
         with pytest.raises(hal.ConfigError, match="real.host: is missing.* --set"):
             load(rig, sim=False)

@@ -2,6 +2,7 @@
 
 hal emulate --config franka_emulator
 hal emulate franka --robot fr3
+hal emulate ur --robot ur5e
 hal emulate can --config yam_emulator
 """
 
@@ -14,7 +15,7 @@ from importlib import import_module
 
 from hal.errors import HalError
 
-DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand"}
+DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand", "ur": "a UR arm"}
 
 
 def parser() -> argparse.ArgumentParser:

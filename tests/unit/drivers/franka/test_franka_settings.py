@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from hal.config import load
+from hal.config.schema import is_own_host
 from hal.drivers.franka.limits import FER, FR3
-from hal.drivers.franka.settings import ArmSettings, HandSettings, check_arm, check_hand, is_emulated
+from hal.drivers.franka.settings import ArmSettings, HandSettings, check_arm, check_hand
 from hal.errors import ConfigError
 from hal.specs import GripperSpec, LimitsSpec, RobotSpec
 
@@ -142,14 +143,14 @@ def test_invalid_settings_of_a_hand() -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1", "localhost", " LOCALHOST. "])
-def test_a_robot_on_this_computer_is_emulated(host: str) -> None:
-    assert is_emulated({"host": host})
+def test_a_robot_on_this_computer_is_own_host(host: str) -> None:
+    assert is_own_host({"host": host})
 
 
 @pytest.mark.parametrize("host", ["172.16.0.2", "localhost.lab.example", "127.0.0.1.lab.example", 127, None])
 def test_another_robot_is_not_emulated(host: object) -> None:
-    assert not is_emulated({"host": host})
-    assert not is_emulated({})
+    assert not is_own_host({"host": host})
+    assert not is_own_host({})
 
 
 def test_the_rehearsals_rig_is_emulated_and_the_labs_is_not() -> None:

@@ -1,0 +1,297 @@
+"""Connection to a UR controller through ur_rtde, and the thread that makes every call which may block.
+
+ur_rtde's constructors keep Python's lock while they wait, so they are called in :meth:`UrLink.open` only, once the
+ports have answered. Its other calls release the lock. Its objects are never deleted, as that keeps the lock, too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import dashboard_client
+import rtde_control
+import rtde_receive
+
+from hal.errors import ConnectionLost, Fault
+from hal.lock import DeviceLock
+
+from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN
+from .settings import UrSettings
+
+__all__ = ["WATCHDOG_HZ", "UrLink", "lock_arm", "probe"]
+
+RTDE, DASHBOARD, SCRIPTS = 30004, 29999, 30002
+WATCHDOG_HZ = 8.0
+"""The controller ends the control program if nothing comes for the inverse of this: 125 ms."""
+_KICK = 0.02
+"""Time after which the watchdog is kicked if no set-point was sent, s."""
+_START = 0.8
+"""Longest time until the control program runs, s."""
+_RETRY = 0.5
+"""Time between attempts to connect again, s."""
+_VARIABLES = ["timestamp", "target_q", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "robot_mode"]
+_VARIABLES += ["safety_mode", "runtime_state", "speed_scaling", "target_speed_fraction", "safety_status_bits"]
+_VARIABLES += ["robot_status_bits"]
+_PAYLOAD = ["payload", "payload_cog"]
+_kept: list[Any] = []
+"""Objects of ur_rtde, until the process ends."""
+
+
+def lock_arm(host: str) -> DeviceLock:
+    """Reserve the arm at ``host`` for this process. Raises ControlTaken."""
+    return DeviceLock(f"ur-{host}", f"the arm at {host}", patience=1.0)
+
+
+def probe(host: str, timeout: float = 1.0) -> str:
+    """Return why a controller does not answer, naming the port; an empty text if it does.
+
+    Its RTDE port must answer a request, and its dashboard must greet.
+    """
+    for port, request in ((DASHBOARD, b""), (RTDE, b"\0\5V\0\2"), (SCRIPTS, None)):
+        try:
+            with socket.create_connection((host, port), timeout) as line:
+                if request is not None:
+                    line.sendall(request)
+                    if not line.recv(64):
+                        return f"port {port} of {host} hangs up"
+        except OSError as error:
+            return f"port {port} of {host}: {error.strerror or error}"
+    return ""
+
+
+class UrLink:
+    """A connection. The attributes are written by one thread and read by the other.
+
+    Args:
+        name: The arm's name.
+        settings: Its settings.
+        rate_hz: Rate of states and set-points.
+        tcp: The tcp in the frame of the flange (m, rotation vector in rad); None to leave the installation's.
+    """
+
+    def __init__(self, name: str, settings: UrSettings, rate_hz: float, tcp: list[float] | None) -> None:
+        self.name, self.settings, self.rate_hz, self.tcp = name, settings, rate_hz, tcp
+        self.receive: Any = None
+        """ur_rtde's RTDEReceiveInterface; None until open."""
+        self.running = False
+        """Whether the control program runs, and takes set-points."""
+        self.refused: Fault | None = None
+        """Why the control program was not started."""
+        self.local = False
+        """Whether the controller was in local control when that was last asked."""
+        self.sent: list[float] | None = None
+        """The newest set-point that was sent, rad; None before the first one of a program."""
+        self.longest_gap = 0.0
+        """Longest time between two messages since the program started, s."""
+        self.t_late = 0.0
+        """When this computer was last silent for nearly as long as the watchdog allows, s."""
+        self.starting = False
+        self.version, self.rate, self.has_payload = "", 0.0, False
+        """Of the controller: PolyScope, cycles in a second, and whether it reports the payload."""
+        self._target: list[float] | None = None
+        self._wake = threading.Condition()
+        self._jobs: list[Callable[[], None]] = []
+        self._thread: threading.Thread | None = None
+        self._ours = self._closing = False
+        self._lock: DeviceLock | None = None
+
+    # Called by the cycle.
+
+    def open(self) -> None:
+        """Connect. Raises ConnectionLost and ControlTaken."""
+        host = self.settings.host
+        self._lock = lock_arm(host)
+        why = probe(host)
+        if why:
+            raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
+        try:
+            self._dashboard = dashboard_client.DashboardClient(host)
+            self._dashboard.connect()
+            self.version = str(self._dashboard.polyscopeVersion())
+            version = [int(part) for part in self.version.split(".")[:2]]
+            self.rate = 125.0 if version < [4, 0] else 500.0
+            self._has_remote = version >= [5, 6]
+            self.has_payload = self._has_remote or [3, 11] <= version < [4, 0]
+            variables = _VARIABLES + (_PAYLOAD if self.has_payload else [])
+            upper = self.settings.upper_registers
+            self.receive = rtde_receive.RTDEReceiveInterface(host, self.rate_hz, variables, False, upper)
+            flags = rtde_control.RTDEControlInterface
+            chosen = int(flags.FLAG_NO_WAIT) | int(flags.FLAG_DISABLE_REMOTE_CONTROL_CHECK)  # no program is started
+            chosen |= int(flags.FLAG_NO_EXT_FT)  # an input that is not used, and that another client may have
+            chosen |= int(flags.FLAG_UPPER_RANGE_REGISTERS) if upper else 0
+            self._control = rtde_control.RTDEControlInterface(host, self.rate_hz, chosen)
+        except (RuntimeError, ValueError) as error:  # all that ur_rtde raises
+            self.receive = None
+            if "registers are already in use" in str(error):
+                raise ConnectionLost.of(self.name, REGISTERS_TAKEN) from None
+            raise ConnectionLost(f"{self.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code) from error
+        _kept.extend((self._dashboard, self.receive, self._control))
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=f"ur-{self.name}", daemon=True)
+        self._thread.start()
+
+    def send(self, q: list[float]) -> None:
+        """Send a set-point soon; a newer one replaces one that is waiting."""
+        with self._wake:
+            self._target = q
+            self._wake.notify()
+
+    def start(self) -> None:
+        """Start the control program soon: then ``running`` is True, or ``refused`` says why not."""
+        self.refused, self.starting = None, True
+        self._call(self._start)
+
+    def note_stopped(self) -> None:
+        """Note that no program is running."""
+        if not self.starting:
+            self.running = self._ours = False
+
+    def ask_remote(self) -> None:
+        """Ask soon whether the controller is in local control."""
+        self._call(self._ask_remote)
+
+    def unlock(self) -> str:
+        """Unlock a protective stop; return why that was not possible. Blocks for at most 3 s."""
+        answers: list[str] = []
+
+        def unlock() -> None:
+            try:
+                self._dashboard.closeSafetyPopup()
+                self._dashboard.unlockProtectiveStop()
+                answers.append("")
+            except RuntimeError as error:  # the controller's own words
+                answers.append(str(error))
+
+        self._finish(unlock)
+        return answers[0] if answers else "the dashboard does not answer"
+
+    def ask_local(self) -> bool:
+        """Return whether the controller is in local control. Blocks for at most 3 s."""
+        self._finish(self._ask_remote)
+        return self.local
+
+    def _finish(self, job: Callable[[], None]) -> None:
+        done = threading.Event()
+
+        def run() -> None:
+            try:
+                job()
+            finally:
+                done.set()
+
+        self._call(run)
+        done.wait(3.0)
+
+    def lose(self) -> None:
+        """Note that the controller is silent: what it does is no longer known."""
+        self.running, self.starting, self._target = False, False, None
+
+    def close(self) -> None:
+        """End the control program, and disconnect. Idempotent."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join(4.0)
+        self.running, self.receive = False, None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _call(self, job: Callable[[], None]) -> None:
+        with self._wake:
+            self._jobs.append(job)
+            self._wake.notify()
+
+    # The thread.
+
+    def _run(self) -> None:
+        receive, control = self.receive, self._control
+        last = time.monotonic()
+        while not self._closing:
+            with self._wake:
+                if not self._jobs and self._target is None:
+                    self._wake.wait(_KICK)
+                target, self._target = self._target, None
+                jobs, self._jobs = self._jobs, []
+            gap = time.monotonic() - last
+            if gap > 0.7 / WATCHDOG_HZ:
+                self.t_late = time.monotonic()
+            self.longest_gap = max(self.longest_gap, gap)
+            try:
+                if not receive.isConnected() or not control.isConnected():
+                    self.lose()
+                    self._reconnect(receive, control)
+                elif jobs:
+                    for job in jobs:
+                        job()
+                elif self.running:
+                    self._serve(control, target)
+            except RuntimeError as error:
+                print(f"{self.name}: ur_rtde: {error}", file=sys.stderr)
+                self.lose()
+            last = time.monotonic()
+        with contextlib.suppress(RuntimeError):
+            if self._ours and control.isConnected():
+                control.stopScript()
+            control.disconnect()
+            receive.disconnect()
+
+    def _serve(self, control: Any, target: list[float] | None) -> None:
+        if target is None:
+            control.kickWatchdog()
+        elif control.servoJ(target, 0.0, 0.0, 1.0 / self.rate_hz, self.settings.lookahead_time, self.settings.gain):
+            self.sent = target
+
+    def _reconnect(self, receive: Any, control: Any) -> None:
+        for _ in range(int(_RETRY / _KICK)):
+            time.sleep(_KICK)
+            if self._closing:
+                return
+        if probe(self.settings.host):
+            return
+        if not receive.isConnected():
+            receive.reconnect()
+        if not control.isConnected():
+            control.reconnect()
+        self._dashboard.disconnect()
+        self._dashboard.connect()
+
+    def _ask_remote(self) -> None:
+        self.local = self._has_remote and not self._dashboard.isInRemoteControl()
+
+    def _start(self) -> None:
+        try:
+            self.refused = self._start_program()
+            self.running = self.refused is None
+        finally:
+            self.starting = False
+
+    def _start_program(self) -> Fault | None:
+        """Start the control program with its watchdog; return why that was not possible."""
+        control, load = self._control, self.settings.load
+        self._ask_remote()
+        if self.local:
+            return LOCAL
+        if self.receive.getRuntimeState() == PLAYING and not self._ours:
+            return OTHER_PROGRAM
+        self._ours, self._target, self.sent, self.longest_gap = True, None, None, 0.0
+        end = time.monotonic() + _START
+        control.reuploadScript()  # also ends an old one of ours
+        while not (control.isProgramRunning() and self.receive.getRuntimeState() == PLAYING):
+            if time.monotonic() > end:
+                return NOT_STARTED
+            time.sleep(0.002)
+        ready = control.setWatchdog(WATCHDOG_HZ)
+        ready = ready and (self.tcp is None or control.setTcp(self.tcp))
+        if load is not None and ready:
+            com = load.com if any(load.com) else (0.0, 0.0, 1e-6)  # for zeros ur_rtde keeps the present centre
+            ready = control.setPayload(load.mass, list(com))
+        return None if ready else NOT_STARTED

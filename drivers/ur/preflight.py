@@ -1,0 +1,127 @@
+"""Pre-flight check of a UR arm: reachable, ready for a program, its speed, tcp and payload, and late states.
+
+Nothing moves, and no program is started. Checks run in the order in which they can succeed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from hal.errors import ConnectionLost, ControlTaken
+from hal.geometry import Pose
+from hal.kinematics.arm import Kinematics
+from hal.preflight import CheckResult
+from hal.specs import RobotSpec
+
+from .arm import find_tcp
+from .faults import LOCAL, NO_CONTROLLER, OTHER_PROGRAM, PLAYING, RUNNING, SAFETY, mode_fault, scaling_fault
+from .link import UrLink, probe
+from .settings import UrSettings
+
+_FAR, _TURNED = 0.001, 0.005
+"""Difference of two tcps that is named, m and rad."""
+_LATE = 2.5
+"""Periods without a state from which one is late."""
+
+
+def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
+    """Check one arm.
+
+    Args:
+        spec: The arm in the rig.
+        duration: Time for measuring its states, s.
+
+    Yields:
+        One result per check.
+    """
+    settings = UrSettings.of(spec)
+    why = probe(settings.host)
+    if why:
+        remedy = f"start it in another terminal: hal emulate ur --host {settings.host}"
+        yield CheckResult("controller", "fail", why, remedy if spec.emulated else NO_CONTROLLER.remedy)
+        return
+    link = UrLink(spec.name, settings, spec.rate_hz, None)
+    try:
+        link.open()
+        yield CheckResult("controller", "ok", f"{settings.host} answers; PolyScope {link.version}, {link.rate:g} Hz")
+        yield from _check_state(link)
+        yield _check_tcp(spec, settings, link.receive)
+        yield _check_payload(settings, link)
+        yield _check_states(spec, link, duration)
+    except ControlTaken as error:
+        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
+    except ConnectionLost as error:
+        fault = error.fault or NO_CONTROLLER
+        yield CheckResult("controller", "fail", str(error), fault.remedy)
+    finally:
+        link.close()
+
+
+def _check_state(link: UrLink) -> Iterator[CheckResult]:
+    receive = link.receive
+    safety, mode, slider = receive.getSafetyMode(), receive.getRobotMode(), receive.getTargetSpeedFraction()
+    found = [SAFETY[safety]] if safety in SAFETY else [mode_fault(mode)] if mode != RUNNING else []
+    found += [LOCAL] if link.ask_local() else []
+    found += [OTHER_PROGRAM] if receive.getRuntimeState() == PLAYING else []
+    found += [scaling_fault(slider, slider=True)] if slider < 1.0 else []
+    for fault in found:
+        yield CheckResult("state", "warn", fault.cause, fault.remedy)
+    if not found:
+        yield CheckResult("state", "ok", "ready to move")
+
+
+def _check_tcp(spec: RobotSpec, settings: UrSettings, receive: Any) -> CheckResult:
+    """Compare the controller's tcp with the model's: they differ by the installation's tcp, and by the calibration."""
+    x, y, z, *turn = receive.getActualTCPPose()
+    angle = float(np.linalg.norm(turn))
+    axis = np.array(turn) * 0.5 * np.sinc(0.5 * angle / np.pi)
+    theirs = Pose((x, y, z), (*axis, np.cos(angle / 2.0)))
+    half_turn = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))  # from the controller's base to that of UR's models
+    distance, rotation = (half_turn @ theirs).distance(Kinematics(spec.kinematics).pose(receive.getActualQ()))
+    found = f"{1e3 * distance:.1f} mm and {rotation:.3f} rad between the controller's and the model's"
+    if distance <= _FAR and rotation <= _TURNED:
+        return CheckResult("tcp", "ok", found)
+    sets = settings.set_tcp and find_tcp(spec) is not None
+    remedy = "the model's is set when a session opens" if sets else "set the model's in the installation"
+    remedy += "; what stays then is the factory calibration, which this driver does not use: poses have that error"
+    return CheckResult("tcp", "warn", found, remedy)
+
+
+def _check_payload(settings: UrSettings, link: UrLink) -> CheckResult:
+    if not link.has_payload:
+        return CheckResult("payload", "unknown", "this PolyScope does not report it", "check it in the installation")
+    mass, com = link.receive.getPayload(), link.receive.getPayloadCog()
+    found = f"{mass:.2f} kg at [{', '.join(f'{value:.3f}' for value in com)}] m in the installation"
+    load = settings.load
+    if load is None:
+        return CheckResult("payload", "ok", f"{found}; real.load is not set, so it stays")
+    if abs(load.mass - mass) < 0.01 and max(abs(a - b) for a, b in zip(load.com, com, strict=True)) < 0.002:
+        return CheckResult("payload", "ok", f"{found}, as the rig has it")
+    wanted = f"the rig has {load.mass:g} kg at {list(load.com)} m"
+    remedy = "the rig's is set when a session opens; correct the wrong one"
+    return CheckResult("payload", "warn", f"{found}; {wanted}", remedy)
+
+
+def _check_states(spec: RobotSpec, link: UrLink, duration: float) -> CheckResult:
+    """Measure when states come."""
+    if abs(link.rate - spec.rate_hz) > 1.0:
+        found = f"the controller runs at {link.rate:g} Hz, the model at {spec.rate_hz:g} Hz"
+        return CheckResult("states", "fail", found, f"set rate_hz: {link.rate:g} in the arm's model")
+    receive, end = link.receive, time.monotonic() + max(duration, 0.2)
+    last = receive.getTimestamp()
+    times: list[float] = []
+    while time.monotonic() < end:
+        time.sleep(2e-4)
+        if (now := receive.getTimestamp()) != last:
+            times.append(time.monotonic())
+            last = now
+    gaps = np.diff(times) if len(times) > 1 else np.array([np.inf])
+    late = int((gaps > _LATE / spec.rate_hz).sum())
+    found = f"{len(times)} states, longest gap {1e3 * gaps.max():.1f} ms, {late} late"
+    if late <= len(times) // 100:
+        return CheckResult("states", "ok", found)
+    return CheckResult("states", "warn", found, "connect the cable directly, end busy programs, use a real-time kernel")

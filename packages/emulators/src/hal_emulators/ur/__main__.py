@@ -1,0 +1,73 @@
+"""The emulator as a program: ``hal emulate ur --help``."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import ipaddress
+import signal
+import sys
+from collections.abc import Sequence
+
+from hal_emulators.control import CONTROL_PORT
+
+from .controller import Controller
+from .motion import ROBOTS
+from .server import DASHBOARD, RTDE, UrServer, help_text
+
+HOME = (0.0, -1.669, 1.659, -1.56, -1.571, 0.0)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program, and return its exit status."""
+    parser = argparse.ArgumentParser(
+        prog="hal emulate ur",
+        description="Emulates the controller of a Universal Robots arm for ur_rtde. What UR does not publish is "
+        "assumed; it proves nothing about a real arm.",
+        epilog="commands of the control port, for example `echo protective | nc HOST 1339`:\n" + help_text(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--robot", choices=sorted(ROBOTS), default="ur5e", help="which arm; ur5 is a CB3 (%(default)s)")
+    add("--host", default="127.0.0.1", type=_loopback, help="address to listen on; the ports are fixed (%(default)s)")
+    add("--q", type=float, nargs=6, default=HOME, metavar="RAD", help="joint positions at the start")
+    add("--payload", type=float, default=0.0, metavar="KG", help="payload of the installation")
+    add(
+        "--tcp",
+        type=float,
+        nargs=6,
+        default=(0.0,) * 6,
+        metavar="M",
+        help="tcp of the installation: m, rotation vector",
+    )
+    add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
+    options = parser.parse_args(arguments)
+    try:
+        server = UrServer(
+            options.host, Controller(options.robot, options.q, options.payload, options.tcp), options.seed
+        )
+    except OSError as error:
+        print(f"error: {options.host}: {error.strerror}", file=sys.stderr)
+        return 1
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: server.stop())
+    gc.freeze()
+    rate = server.controller.rate
+    print(
+        f"ready: {options.robot} at {options.host}, RTDE {RTDE} ({rate} Hz), dashboard {DASHBOARD}, "
+        f"control {options.host}:{CONTROL_PORT}",
+        flush=True,
+    )
+    server.run()
+    server.close()
+    return 0
+
+
+def _loopback(text: str) -> str:
+    if not ipaddress.IPv4Address(text).is_loopback:
+        raise ValueError
+    return text
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,161 @@
+"""Target trajectory of an emulated UR arm, and the arm that follows it, in steps of the controller's cycle.
+
+UR does not publish how ``servoj`` filters its targets. Here two lags in a row, together as long as ``lookahead_time``,
+stand for it; ``gain`` has no effect, and the arm follows its trajectory with a lag of 4 ms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+__all__ = ["ROBOTS", "TargetMotion", "forward"]
+
+Floats = list[float]
+Vector = np.ndarray[Any, np.dtype[np.float64]]
+
+ROBOTS = {
+    "ur3e": ((-0.24355, -0.2132), (0.15185, 0.13105, 0.08535, 0.0921), (500, 3.0)),
+    "ur5e": ((-0.425, -0.3922), (0.1625, 0.1333, 0.0997, 0.0996), (500, 5.0)),
+    "ur10e": ((-0.6127, -0.57155), (0.1807, 0.17415, 0.11985, 0.11655), (500, 12.5)),
+    "ur5": ((-0.425, -0.39225), (0.089159, 0.10915, 0.09465, 0.0823), (125, 5.0)),
+}
+"""Arm -> lengths a2 and a3; d1, d4, d5 and d6, m; rate, Hz, and greatest payload, kg. From UR's article "DH Parameters
+for calculations of kinematics and dynamics"."""
+
+TOP_SPEED = 3.35
+"""Speed above which the arm stops, rad/s: 191 degrees/s, the joints' limit in the safety configuration."""
+TOP_ACCELERATION = 60.0
+"""Acceleration of the target above which the arm stops with C153, rad/s2: chosen; UR does not publish it."""
+_FOLLOWING = 0.004
+"""Lag of the arm behind its target, s."""
+
+
+def forward(robot: str, q: Sequence[float], tcp: Sequence[float]) -> Floats:
+    """Return the pose of the tcp in the controller's base frame: m, and a rotation vector, rad.
+
+    Args:
+        robot: A key of :data:`ROBOTS`.
+        q: Joint positions (6,), rad.
+        tcp: The tcp in the frame of the flange: m, and a rotation vector, rad.
+    """
+    (a2, a3), (d1, d4, d5, d6), _ = ROBOTS[robot]
+    right = math.pi / 2
+    rows = ((0.0, d1, right), (a2, 0.0, 0.0), (a3, 0.0, 0.0), (0.0, d4, right), (0.0, d5, -right), (0.0, d6, 0.0))
+    pose = np.eye(4)
+    for angle, (a, d, alpha) in zip(q, rows, strict=True):
+        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
+        pose = pose @ np.array(
+            [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]]
+        )
+    tool = np.eye(4)
+    tool[:3, :3], tool[:3, 3] = _rotation(np.array(tcp[3:], float)), tcp[:3]
+    pose = pose @ tool
+    return [*pose[:3, 3].tolist(), *_vector(pose[:3, :3]).tolist()]
+
+
+def _rotation(vector: Vector) -> Vector:
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turned: Vector = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return turned
+
+
+def _vector(rotation: Vector) -> Vector:
+    from hal.geometry import matrix_to_quaternion
+
+    x, y, z, w = matrix_to_quaternion(rotation)
+    axis = np.array([x, y, z]) * (1.0 if w >= 0 else -1.0)
+    size = float(np.linalg.norm(axis))
+    turned: Vector = axis * (0.0 if size < 1e-12 else 2.0 * math.atan2(size, abs(w)) / size)
+    return turned
+
+
+class TargetMotion:
+    """The target of the controller and the joints that follow it. All lists are (6,), rad, rad/s, rad/s2."""
+
+    def __init__(self, q: Sequence[float], dt: float) -> None:
+        self.dt = dt
+        self.q, self.dq, self.ddq = list(q), [0.0] * 6, [0.0] * 6
+        self.actual_q, self.actual_dq = list(q), [0.0] * 6
+        self.scale = 1.0
+        """Share of the speed that the slider allows."""
+        self.hold()
+
+    def hold(self) -> None:
+        """Stay where the target is."""
+        self._kind = "hold"
+        self._between = list(self.q)
+
+    def servo(self, q: Sequence[float], lookahead: float) -> None:
+        """Follow a target position, like ``servoj``."""
+        if self._kind != "servo":
+            self._kind, self._between = "servo", list(self.q)
+        self._goal, self._lookahead = list(q), max(lookahead, 0.03)
+
+    def speed(self, dq: Sequence[float], acceleration: float) -> None:
+        """Accelerate to a speed and keep it, like ``speedj``."""
+        self._kind, self._goal, self._most = "speed", list(dq), acceleration
+
+    def stop(self, deceleration: float) -> None:
+        """Come to rest, like ``stopj``."""
+        self._kind, self._goal, self._most = "stop", [0.0] * 6, max(deceleration, 0.1)
+
+    def move(self, q: Sequence[float], speed: float, acceleration: float) -> None:
+        """Move to a position with a trapezoid of speed, all joints together, like ``movej``."""
+        self._kind, self._from, self._goal = "move", list(self.q), list(q)
+        self._way = max(abs(b - a) for a, b in zip(self.q, q, strict=True))
+        self._done, self._pace = 0.0, 0.0
+        self._top, self._most = max(speed, 1e-3), max(acceleration, 1e-3)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the motion that was started is over."""
+        return self._kind in ("hold", "servo")
+
+    def step(self) -> str | None:
+        """Let a cycle pass. Returns why the arm must stop (``C153``), or None."""
+        dt, before, dq_before = self.dt, self.q, self.dq
+        q = self._next()
+        dq = [(b - a) / dt for a, b in zip(before, q, strict=True)]
+        ddq = [(b - a) / dt for a, b in zip(dq_before, dq, strict=True)]
+        if self._kind == "servo" and (max(map(abs, ddq)) > TOP_ACCELERATION or max(map(abs, dq)) > TOP_SPEED):
+            return "C153"  # the target that jumped is not followed
+        self.q, self.dq, self.ddq = q, dq, ddq
+        share = 1.0 - math.exp(-dt / _FOLLOWING)
+        actual = [a + share * (b - a) for a, b in zip(self.actual_q, q, strict=True)]
+        self.actual_dq = [(b - a) / dt for a, b in zip(self.actual_q, actual, strict=True)]
+        self.actual_q = actual
+        return None
+
+    def _next(self) -> Floats:
+        dt = self.dt * self.scale
+        if self._kind == "servo":
+            share = 1.0 - math.exp(-2.0 * dt / self._lookahead)
+            self._between = [a + share * (b - a) for a, b in zip(self._between, self._goal, strict=True)]
+            return [a + share * (b - a) for a, b in zip(self.q, self._between, strict=True)]
+        if self._kind in ("speed", "stop"):
+            most = max(abs(b - a) for a, b in zip(self.dq, self._goal, strict=True))
+            share = min(1.0, self._most * self.dt / most) if most > 0.0 else 1.0
+            dq = [a + share * (b - a) for a, b in zip(self.dq, self._goal, strict=True)]
+            if self._kind == "stop" and not any(dq):
+                self.hold()
+            return [a + v * self.dt for a, v in zip(self.q, dq, strict=True)]
+        if self._kind == "move":
+            brake = math.sqrt(max(0.0, 2.0 * self._most * (self._way - self._done)))
+            self._pace = min(self._pace + self._most * dt, self._top, brake)
+            self._done += max(self._pace, 1e-4) * dt
+            if self._done >= self._way:
+                goal = self._goal
+                self.q = list(goal)
+                self.hold()
+                return list(goal)
+            share = self._done / self._way
+            return [a + share * (b - a) for a, b in zip(self._from, self._goal, strict=True)]
+        return list(self.q)

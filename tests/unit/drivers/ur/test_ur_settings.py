@@ -1,0 +1,49 @@
+"""The ``real:`` part of a UR arm, and its model against UR's own figures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hal.config import load
+from hal.drivers.ur.settings import check_arm
+from hal.errors import ConfigError
+from hal.geometry import Pose
+from hal.kinematics.arm import Kinematics
+from hal.specs import RobotSpec
+from hal.testing import robot_spec
+from hal_emulators.ur.motion import forward
+
+
+def problems(rate_hz: float = 500.0, joints: int = 6, **options: Any) -> set[str]:
+    spec = robot_spec(joints, driver="ur", rate_hz=rate_hz, options={"host": "192.168.0.3"} | options)
+    return {key for key, _, _ in check_arm(spec)}
+
+
+def test_mistakes_are_named_by_their_key() -> None:
+    assert problems(load={"mass": 1.5, "com": [0, 0, 0.05]}, lookahead_time=0.1, gain=300.0) == set()
+    assert problems(host=None) == {"real.host"}
+    assert problems(lookahead_time=0.01) == {"real.lookahead_time"}
+    assert problems(gain=5000.0) == {"real.gain"}
+    assert problems(load={"mass": -1}) == {"real.load.mass"}
+    assert problems(joints=7) == {"model"}
+    assert problems(rate_hz=1000.0) == {"rate_hz"}
+
+
+def load_ur5e() -> RobotSpec:
+    try:
+        return load({"robots": {"arm": {"model": "ur5e"}}}).resolve().robots[0]
+    except ConfigError as error:
+        pytest.skip(error.problems[0].message)
+
+
+def test_the_models_flange_is_where_the_dh_parameters_of_ur_put_it() -> None:
+    spec = load_ur5e()
+    kinematics = Kinematics(spec.kinematics)
+    tcp = Pose(spec.kinematics.tcp_position, spec.kinematics.tcp_orientation)
+    half_turn = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))  # from the controller's base to that of the model
+    for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 6)):
+        flange = half_turn @ kinematics.pose(q) @ tcp.inverse()
+        assert flange.position == pytest.approx(forward("ur5e", q, [0.0] * 6)[:3], abs=1e-6)

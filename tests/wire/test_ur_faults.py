@@ -1,0 +1,145 @@
+"""Faults of an emulated UR arm, as a program meets them: named in 150 ms with the remedy, the arm at rest."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from math import inf
+
+import pytest
+
+import hal
+from hal_emulators.control import EmulatorControl
+
+from .ur_kit import UrEmulator
+
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
+
+NAMED_WITHIN = 0.150
+FAULTS = {
+    "PROTECTIVE_STOP": ("protective", ""),
+    "EMERGENCY_STOP": ("estop on", "estop off"),
+    "SAFEGUARD_STOP": ("safeguard on", "safeguard off"),
+    "NOT_RUNNING": ("power off", "power on"),
+    "LOCAL_CONTROL": ("remote off", "remote on"),
+    "PROGRAM_STOPPED": ("program", ""),
+    "PROGRAM_STOPPED by another program": ("program thief", "program"),
+    "SPEED_SLIDER": ("slider 0.5", "slider 1"),
+    "SILENT": ("silence 0.6", ""),
+    "SILENT without a connection": ("cut 0.6", ""),
+    "SILENT until late states come": ("late 0.4", "late 0"),
+}
+"""Code, and what it is -> what causes it, and what ends that."""
+
+
+@pytest.fixture(scope="module")
+def emulator() -> Iterator[UrEmulator]:
+    emulator = UrEmulator()
+    yield emulator
+    emulator.close()
+
+
+@pytest.fixture(scope="module")
+def rig(emulator: UrEmulator) -> Iterator[hal.Rig]:
+    with hal.open(emulator.rig(load={"mass": 1.5, "com": [0.0, 0.0, 0.05]})) as rig:
+        yield rig
+
+
+def find_code(arm: hal.Robot) -> str:
+    """Return the code of the arm's present fault, or an empty text."""
+    try:
+        fault = arm.state(max_age=inf).fault
+    except hal.ConnectionLost as error:
+        return error.code
+    assert fault is None or fault.remedy
+    return fault.code if fault is not None else ""
+
+
+def wait_code(arm: hal.Robot, code: str, timeout: float = 8.0) -> None:
+    end = time.monotonic() + timeout
+    while find_code(arm) != code:
+        assert time.monotonic() < end, f"{find_code(arm)!r} in place of {code!r}"
+        time.sleep(0.002)
+
+
+def recover(rig: hal.Rig, arm: hal.Robot) -> None:
+    """Recover, as soon as the controller allows it."""
+    end = time.monotonic() + 8.0
+    while True:
+        try:
+            arm.recover()
+            wait_code(arm, "")
+            return
+        except (hal.RobotFault, hal.ConnectionLost):
+            assert time.monotonic() < end
+            time.sleep(0.05)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover(
+    rig: hal.Rig, emulator: UrEmulator, name: str
+) -> None:
+    arm, (cause, end) = rig.robots["arm"], FAULTS[name]
+    code, named = name.partition(" ")[0], inf
+    arm.move_to(arm.home, unattended=True, speed=0.3)
+    with (
+        pytest.raises(hal.HalError),
+        arm.control(rate_hz=50, unattended=True) as control,
+    ):
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointVelocity([0, 0, 0, 0.2, 0, 0]))
+            if named == inf and max(emulator.status()["dq"]) > 0.1:
+                emulator.control.send(cause)
+                began = time.monotonic()
+                wait_code(arm, code)
+                named = time.monotonic() - began
+            assert tick.elapsed < 10.0
+    print(f"{name}: {1e3 * named:.0f} ms")
+    assert named < NAMED_WITHIN
+    emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 0.5)
+    if end:
+        emulator.control.send(end)
+    if name == "EMERGENCY_STOP":
+        emulator.control.send("power on")
+    recover(rig, arm)
+    assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
+
+
+def test_a_session_gives_the_controller_load_and_tcp_of_the_rig(rig: hal.Rig, emulator: UrEmulator) -> None:
+    rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
+    status = emulator.status()
+    assert status["payload"] == 1.5
+    assert status["tcp"][:3] == pytest.approx([0, 0, 0.14])
+
+
+def test_an_arm_that_runs_another_program_opens_no_session(emulator: UrEmulator) -> None:
+    other = UrEmulator()
+    try:
+        with hal.open(other.rig()) as rig, EmulatorControl(other.host) as control:
+            control.send("program gluing")
+            other.wait_for(lambda status: status["program"] == "gluing")
+            with pytest.raises(hal.RobotFault) as refused:
+                rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
+            assert refused.value.code == "OTHER_PROGRAM"
+            assert other.status()["program"] == "gluing", "it goes on"
+        assert other.status()["program"] == "gluing"
+    finally:
+        other.close()
+
+
+def test_registers_of_another_client_are_named_and_can_be_avoided() -> None:
+    other = UrEmulator()
+    import rtde_control
+
+    client = rtde_control.RTDEControlInterface(other.host, 500.0, rtde_control.RTDEControlInterface.FLAG_UPLOAD_SCRIPT)
+    try:
+        with pytest.raises(hal.ConnectionLost) as refused:
+            hal.open(other.rig())
+        assert refused.value.code == "REGISTERS_TAKEN"
+        client.stopScript()
+        with hal.open(other.rig(upper_registers=True)) as rig:
+            arm = rig.robots["arm"]
+            assert abs(arm.move_to(arm.home + 0.05, unattended=True).q - arm.home - 0.05).max() < 2e-3
+    finally:
+        client.disconnect()
+        other.close()

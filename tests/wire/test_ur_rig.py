@@ -1,0 +1,149 @@
+"""An emulated UR arm with the unmodified ur_rtde: in a program of its own, and behind hal.open."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hal
+
+from .test_ur_faults import recover, wait_code
+from .ur_kit import UrEmulator
+
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
+
+STOPS_WITHIN = 0.150
+"""From the end of the host's messages to the end of the program, s."""
+APP = """
+import sys, hal, json
+with hal.open(json.loads(sys.argv[1])) as rig, rig.robots["arm"].control(rate_hz=50, unattended=True) as control:
+    for tick in rig.clock.rate(50):
+        control.send(hal.JointVelocity([0, 0, 0, 0.1, 0, 0]))
+"""
+
+
+@pytest.fixture
+def emulator() -> Iterator[UrEmulator]:
+    emulator = UrEmulator()
+    yield emulator
+    emulator.close()
+
+
+def test_a_program_of_its_own_moves_the_arm_with_ur_rtde(emulator: UrEmulator) -> None:
+    command = [sys.executable, str(Path(__file__).with_name("ur_client.py")), emulator.host]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 0, ended.stderr
+    done: dict[str, Any] = json.loads(ended.stdout.splitlines()[-1])
+    assert done["dashboard"] == [True, "Robotmode: RUNNING", "UR5"]
+    assert done["moveJ"] == pytest.approx([0, 0, 0, 0, 0, 0.4], abs=1e-3)
+    assert done["servoJ"] == pytest.approx([0, 0, 0, 0, 0.1, 0.4], abs=1e-3)
+    assert done["speed"] == pytest.approx(0.3, abs=0.01)
+    assert done["still"][0] < 0.01
+    assert done["still"][1]
+    assert done["jump"][0]
+    assert not done["jump"][2]
+    assert abs(done["jump"][1]) < 0.05, "it does not follow a jump"
+    assert "5s" in done["too early"]
+    assert done["unlocked"] == [False, True]
+    assert [done["again"], done["watchdog"]] == [True, False]
+
+
+def find_children() -> set[int]:
+    return set(map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()))
+
+
+def drive(rig: hal.Rig, emulator: UrEmulator, act: Any) -> None:
+    """Move until the session ends; ``act`` once the arm moves."""
+    with (
+        pytest.raises(hal.HalError),
+        rig.robots["arm"].control(rate_hz=50, unattended=True) as control,
+    ):
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointVelocity([0, 0, 0, 0.2, 0, 0]))
+            if tick.elapsed > 0.4 and act is not None:
+                assert max(emulator.status()["dq"]) > 0.1
+                act = act()
+            assert tick.elapsed < 10.0
+
+
+def test_the_controller_stops_its_program_when_the_host_is_killed(emulator: UrEmulator) -> None:
+    before = find_children()
+    with hal.open(emulator.rig()) as rig:
+        (host,) = find_children() - before
+        drive(rig, emulator, lambda: os.kill(host, signal.SIGKILL))
+        killed = emulator.wait_for(lambda status: not status["program"])
+        assert "watchdog" in killed["events"][-1]
+    rest = emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 0.5)
+    time.sleep(0.1)
+    assert emulator.status()["q"] == pytest.approx(rest["q"], abs=1e-3), "it stands"
+
+
+def test_the_arm_stands_150_ms_after_the_last_message(emulator: UrEmulator) -> None:
+    before = find_children()
+    times: list[float] = []
+    with hal.open(emulator.rig()) as rig:
+        (host,) = find_children() - before
+
+        def freeze() -> None:
+            os.kill(host, signal.SIGSTOP)
+            times.append(emulator.status()["now"])
+            status = emulator.wait_for(lambda status: not status["program"] and max(map(abs, status["dq"])) < 1e-3)
+            times.append(status["now"])
+            os.kill(host, signal.SIGCONT)
+
+        drive(rig, emulator, freeze)
+        arm = rig.robots["arm"]
+        wait_code(arm, "WATCHDOG")
+        recover(rig, arm)
+        assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
+    print(f"at rest {1e3 * (times[1] - times[0]):.0f} ms after the last message")
+    assert times[1] - times[0] < STOPS_WITHIN
+
+
+def test_the_arm_stands_when_the_app_is_killed(emulator: UrEmulator) -> None:
+    with subprocess.Popen([sys.executable, "-c", APP, json.dumps(emulator.rig())]) as app:
+        emulator.wait_for(lambda status: max(status["dq"]) > 0.05, 30.0)
+        app.kill()
+    emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 1.0)
+    emulator.wait_for(lambda status: not status["program"], 20.0)
+
+
+def test_the_same_program_ends_at_the_same_poses_on_the_arm_and_in_simulation(emulator: UrEmulator) -> None:
+    pytest.importorskip("airo_models", reason="needs airo-models: pip install 'robot-hal[robots]'")
+
+    def run(rig: hal.Rig) -> list[Any]:
+        arm, found = rig.robots["arm"], []
+        for change in ([0.2, -0.1, 0.1, 0, 0, 0.3], [-0.2, 0.1, -0.2, 0.2, 0.1, 0], [0.0] * 6):
+            arm.move_to(arm.home + change, unattended=True, speed=0.3)
+            rig.clock.sleep(0.3)
+            found.append(arm.state())
+        return found
+
+    with hal.open(emulator.rig()) as rig:
+        real = run(rig)
+    with hal.open(emulator.rig(), sim=True, clock="lock_step") as rig:
+        simulated = run(rig)
+    off = max(float(np.abs(a.q - b.q).max()) for a, b in zip(real, simulated, strict=True))
+    apart = max(a.tcp.distance(b.tcp)[0] for a, b in zip(real, simulated, strict=True))
+    print(f"{1e3 * apart:.3f} mm, {off:.5f} rad")
+    assert off < 0.003
+    assert apart < 0.001
+
+
+def test_a_lost_state_now_and_then_stops_nothing(emulator: UrEmulator) -> None:
+    with hal.open(emulator.rig()) as rig:
+        emulator.control.send("lose 0.3")
+        arm = rig.robots["arm"]
+        assert abs(arm.move_to(arm.home + 0.2, unattended=True, speed=0.3).q - arm.home - 0.2).max() < 2e-3
+        assert arm.state(max_age=inf).fault is None
