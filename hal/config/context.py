@@ -17,14 +17,14 @@ from typing import Any, TypeVar
 from .. import registry
 from ..errors import HalError
 from ..geometry import Pose
-from ..kinematics.composition import MountedTool, compose_urdf
+from ..kinematics.composition import FLANGE, MountedTool, compose_urdf
 from ..kinematics.hulls import FORMATS
 from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
 from ..specs import CameraSpec, RobotSpec
 from .data_files import user_path
 from .files import Problems, find_file, leave_holes, read_yaml, suggest, validate
-from .models import CameraModel, FileSource, GripperModel, RobotModel
+from .models import CameraModel, FileSource, GripperFile, GripperModel, RobotModel, TcpModel
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
@@ -111,6 +111,8 @@ class Context:
                 data = read_yaml(found, self.problems)
                 if data is not None and isinstance(config, RobotConfig):
                     data = self._choose_arm(key, config, data)
+                    if data is not None:
+                        data = self._mount_gripper(key, config, data, found)
                 if data is not None:
                     return validate(kind, data, found, self.problems), found
             else:
@@ -131,6 +133,44 @@ class Context:
             self.report(f"{key}.arm", message, "unknown_arm")
             return None
         return {**{name: value for name, value in data.items() if name != "arms"}, **own}
+
+    def _mount_gripper(self, key: str, config: RobotConfig, data: dict[str, Any], file: Path) -> dict[str, Any] | None:
+        """Return an arm's model with the gripper that the rig names in place of its own; None, and the problems."""
+        chosen, mount = config.gripper.model, config.gripper.mount
+        if chosen is None:
+            if mount is not None:
+                self.report(f"{key}.gripper.mount", "belongs to a gripper that is named by model", "missing_key")
+            return data
+        where = find_file(chosen, "gripper model", self.base, "robots", "grippers")
+        if isinstance(where, str):
+            self.report(f"{key}.gripper.model", where, "unknown_model")
+            return None
+        before = len(self.problems.found)
+        own = read_yaml(where, self.problems)
+        gripper = None if own is None else validate(GripperFile, own, where, self.problems)
+        if mount is None and "flange" in data:
+            mount = validate(TcpModel, data["flange"], file, self.problems, "flange")
+        if mount is None:
+            message = (
+                f"is missing: model {config.model!r} has no flange; give the link, and the pose of the gripper in it"
+            )
+            self.report(f"{key}.gripper.mount", message, "missing_key")
+        if own is None or gripper is None or mount is None or len(self.problems.found) > before:
+            return None
+        flange = Pose(mount.position, mount.orientation)
+        tcp = flange @ Pose(gripper.tcp.position, gripper.tcp.orientation)
+        urdf = (
+            {"path": str(user_path(gripper.urdf.path, where.parent))} if gripper.urdf.package is None else own["urdf"]
+        )
+        placed = {name: own[name] for name in ("position", "orientation") if name in own}
+        tool = {"urdf": urdf, "link": mount.link, **placed, "flange": mount.model_dump(exclude={"link"})}
+        return {
+            **data,
+            "tool": tool,
+            "tcp": {"link": mount.link, "position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()},
+            "links": {**(data.get("links") or {}), "hand": FLANGE},
+            "gripper": {name: value for name, value in own.items() if name in GripperModel.model_fields},
+        }
 
     def choose_driver(
         self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None = None
@@ -216,7 +256,8 @@ def load_arm(model: RobotModel, file: Path, problems: Problems, warnings: list[s
         own = _locate(tool.urdf, file.parent, file, "tool.urdf", problems, (".urdf",))
         if own is None:
             return None
-        mounted = MountedTool(own, tool.link, Pose(tool.position, tool.orientation))
+        flange = None if tool.flange is None else Pose(tool.flange.position, tool.flange.orientation)
+        mounted = MountedTool(own, tool.link, Pose(tool.position, tool.orientation), flange)
     try:
         for path in (arm, *([mounted.urdf] if mounted is not None else [])):
             read_urdf(path)

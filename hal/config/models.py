@@ -26,6 +26,7 @@ from .schema import (
     Name,
     Offset,
     Pixels,
+    PoseConfig,
     Quantity,
     QuaternionConfig,
     RateHz,
@@ -174,6 +175,18 @@ class GripperModel(Strict):
         return (first.open - first.closed) * (far - near) * (more - less) < 0.0  # type: ignore[operator]  # both given
 
 
+class GripperFile(GripperModel):
+    """A gripper that is not part of an arm's model; a rig mounts it on the flange of an arm."""
+
+    description: str = ""
+    urdf: FileSource
+    position: Offset = (0.0, 0.0, 0.0)
+    orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+    """Pose of the root of the URDF in the frame of the flange."""
+    tcp: PoseConfig
+    """The tool centre point in the frame of the flange."""
+
+
 class ToolModel(Strict):
     """A gripper or a tool with a URDF of its own, fixed to a link of the arm.
 
@@ -185,7 +198,9 @@ class ToolModel(Strict):
     """Link of the arm."""
     position: Offset = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
-    """Pose of the root of the tool in the frame of that link."""
+    """Pose of the root of the tool in the frame of that link, or of its flange."""
+    flange: PoseConfig | None = None
+    """Pose in that link of the frame ``tool_flange``. What the arm's own URDF has on the link is then left out."""
 
 
 class RobotModel(Strict):
@@ -195,6 +210,8 @@ class RobotModel(Strict):
     urdf: FileSource
     tool: ToolModel | None = None
     """What is mounted on the arm and not in its URDF."""
+    flange: TcpModel | None = None
+    """Where a gripper is mounted that a rig chooses: z points out, x forward, and fingers move along y."""
     freed: tuple[str, ...] = ()
     """Joints that the URDF has fixed, with limits, and that turn."""
     arms: dict[Name, dict[str, Any]] = Field(default_factory=dict)

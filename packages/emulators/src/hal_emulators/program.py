@@ -1,7 +1,8 @@
-"""The program ``hal emulate``: a Franka arm with its hand, or every arm on a CAN bus of a rig.
+"""The program ``hal emulate``: a Franka arm with its hand, or every arm on a CAN bus or Robotiq gripper of a rig.
 
 hal emulate franka --robot fr3
 hal emulate can --config yam_emulator
+hal emulate robotiq --config franka_robotiq
 """
 
 from __future__ import annotations
@@ -12,7 +13,11 @@ from importlib import import_module
 
 __all__ = ["main", "parser"]
 
-DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand"}
+DEVICES = {
+    "can": "every arm on a CAN bus of a rig",
+    "franka": "a Franka arm and its hand",
+    "robotiq": "every Robotiq gripper of a rig",
+}
 
 
 def parser() -> argparse.ArgumentParser:
