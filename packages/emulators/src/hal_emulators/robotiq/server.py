@@ -6,7 +6,6 @@ with RobotiqEmulator("fr3_robotiq") as emulator:
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import signal
