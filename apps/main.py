@@ -37,7 +37,7 @@ PROGRAMS = {
     "grasp": "find an object and grasp it",
     "push": "find an object and push it to a goal",
     "export": "convert a dataset for training",
-    "calibrate": "measure where a camera is, or where a gripper is closed",
+    "calibrate": "measure where a camera is; home a gripper, or measure where it is closed",
 }
 GROUP = "hal.apps"
 """Group of the entry points of programs that other packages have."""

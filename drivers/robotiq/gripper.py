@@ -20,7 +20,9 @@ _CLEARED = 0.2
 """Time after the start of an activation in which the fault from before it may still be reported, s."""
 _CLOSE_TIMEOUT = 0.2
 """Time for moving fingers to take a stop before the connection is closed, s."""
-_ACTIVATE = "take out what is between the fingers, then call gripper.home(): they open and close"
+_ACTIVATE = (
+    "take out what is between the fingers, then let them open and close: hal calibrate gripper, or gripper.home()"
+)
 _FAULTS = {
     0x08: Fault("too_hot", "the gripper is above its operating temperature", "let it cool down"),
     0x0A: Fault("low_voltage", "the supply of the gripper is below its least voltage", f"check it (24 V); {_ACTIVATE}"),

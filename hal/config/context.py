@@ -59,6 +59,8 @@ class Context:
     """Those of :attr:`emulated` that no clock can step."""
     drivers: dict[str, str] = field(default_factory=dict)
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
+    gripper_files: dict[str, Path] = field(default_factory=dict)
+    """Files of the grippers that are not part of their arm's model, by the keys of the arms in the rig."""
 
     @property
     def rig_sim(self) -> bool:
@@ -135,41 +137,45 @@ class Context:
         return {**{name: value for name, value in data.items() if name != "arms"}, **own}
 
     def _mount_gripper(self, key: str, config: RobotConfig, data: dict[str, Any], file: Path) -> dict[str, Any] | None:
-        """Return an arm's model with the gripper that the rig names in place of its own; None, and the problems."""
-        chosen, mount = config.gripper.model, config.gripper.mount
-        if chosen is None:
+        """Return an arm's model with the gripper that the rig or the model names; None, and a problem, if it has some.
+
+        The gripper takes the place of what the arm's own URDF has on its flange.
+        """
+        chosen, mount, own = config.gripper.model, config.gripper.mount, data.get("gripper")
+        name = own if chosen is None and isinstance(own, str) else chosen
+        if name is None:
             if mount is not None:
-                self.report(f"{key}.gripper.mount", "belongs to a gripper that is named by model", "missing_key")
+                self.report(f"{key}.gripper.mount", "needs a gripper that model names", "missing_key")
             return data
-        where = find_file(chosen, "gripper model", self.base, "robots", "grippers")
-        if isinstance(where, str):
-            self.report(f"{key}.gripper.model", where, "unknown_model")
+        base = self.base if chosen is not None else file.parent
+        found = find_file(name, "gripper model", base, "robots", "grippers")
+        if isinstance(found, str):
+            where = (self.source, f"{key}.gripper.model") if chosen is not None else (file, "gripper")
+            self.problems.add(*where, found, "unknown_model")
             return None
         before = len(self.problems.found)
-        own = read_yaml(where, self.problems)
-        gripper = None if own is None else validate(GripperFile, own, where, self.problems)
+        given = read_yaml(found, self.problems)
+        gripper = validate(GripperFile, given or {}, found, self.problems)
         if mount is None and "flange" in data:
             mount = validate(TcpModel, data["flange"], file, self.problems, "flange")
-        if mount is None:
-            message = (
-                f"is missing: model {config.model!r} has no flange; give the link, and the pose of the gripper in it"
-            )
+        elif mount is None:
+            message = f"is missing: model {config.model!r} has no flange; give a link, and the pose of a flange in it"
             self.report(f"{key}.gripper.mount", message, "missing_key")
-        if own is None or gripper is None or mount is None or len(self.problems.found) > before:
+        if given is None or mount is None or len(self.problems.found) > before:
             return None
+        self.gripper_files[key] = found
         flange = Pose(mount.position, mount.orientation)
         tcp = flange @ Pose(gripper.tcp.position, gripper.tcp.orientation)
-        urdf = (
-            {"path": str(user_path(gripper.urdf.path, where.parent))} if gripper.urdf.package is None else own["urdf"]
-        )
-        placed = {name: own[name] for name in ("position", "orientation") if name in own}
-        tool = {"urdf": urdf, "link": mount.link, **placed, "flange": mount.model_dump(exclude={"link"})}
+        urdf = gripper.urdf.model_dump()
+        if gripper.urdf.package is None:
+            urdf["path"] = str(user_path(gripper.urdf.path, found.parent))
+        tool = {"urdf": urdf, "link": mount.link, "position": gripper.position, "orientation": gripper.orientation}
         return {
             **data,
-            "tool": tool,
+            "tool": {**tool, "flange": mount.model_dump(exclude={"link"})},
             "tcp": {"link": mount.link, "position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()},
             "links": {**(data.get("links") or {}), "hand": FLANGE},
-            "gripper": {name: value for name, value in own.items() if name in GripperModel.model_fields},
+            "gripper": {name: value for name, value in given.items() if name in GripperModel.model_fields},
         }
 
     def choose_driver(
@@ -413,8 +419,9 @@ def _add(
     """Add problems (key in the entry, message, code) to the rig's file, or to the model's if that has the key."""
     for relative, message, code in found:
         in_model = _find_model_key(relative, config, model, context)
+        own = context.gripper_files.get(key) if part else None
         if in_model is not None:
-            context.problems.add(file, f"{part}{in_model}", message, code)
+            context.problems.add(own or file, in_model if own else f"{part}{in_model}", message, code)
         else:
             context.report(f"{key}.{part}{relative}", message, code)
 

@@ -57,6 +57,7 @@ def test_an_independent_client_activates_and_moves_the_emulated_gripper() -> Non
         assert far.run(0.05).width == pytest.approx(0.03, abs=1e-3)
 
 
+@pytest.mark.alone
 @LINES
 @pytest.mark.parametrize("fault", ["unplug on", "silent on", "power on", "late 0.5", "lose 1"])
 def test_a_line_that_is_gone_is_known_soon_and_comes_back(line: str, fault: str) -> None:
@@ -65,13 +66,12 @@ def test_a_line_that_is_gone_is_known_soon_and_comes_back(line: str, fault: str)
         far.execute("object 0.03")
         far.driver.move(0.0, 0.1, 60.0)
         assert far.run(1.2).grasped
-        began = monotonic()
+        newest_t = monotonic()
         far.execute(fault.replace("power on", "power 0.5"))
         with pytest.raises(hal.ConnectionLost):
             while True:
-                newest = far.run(0.01)
-        assert monotonic() - began < LOST + 0.1, "with what a busy computer takes"
-        assert began + LOST > newest.t
+                newest_t = far.run(0.01).t
+        assert monotonic() - newest_t < LOST
         with pytest.raises(hal.ConnectionLost):
             far.driver.move(0.05, 0.1, 60.0)
         if not fault.startswith("power"):
@@ -121,16 +121,6 @@ def test_an_answer_that_comes_late_is_stamped_as_old() -> None:
         readings = [far.run(0.01) for _ in range(30)]
         assert all(monotonic() - reading.t > 0.06 for reading in readings[:1])
         assert len({reading.seq for reading in readings}) > 2
-
-
-def test_a_second_program_is_refused() -> None:
-    if os.geteuid() == 0:
-        pytest.skip("the superuser may open a line twice")
-    with emulated_robotiq() as far:
-        far.driver.open()
-        other = type(far.driver)(far.driver.spec)
-        with pytest.raises(hal.ConnectionLost, match="other program"):
-            other.open()
 
 
 def test_the_gripper_keeps_its_grip_when_its_process_is_killed() -> None:
@@ -183,6 +173,7 @@ def droid() -> Iterator[tuple[list[str], RobotiqProgram]]:
         far.close()
 
 
+@pytest.mark.alone
 def test_a_franka_with_a_robotiq_is_checked_activated_grasps_and_replays(
     droid: tuple[list[str], RobotiqProgram], tmp_path: Path
 ) -> None:
