@@ -142,41 +142,27 @@ class Context:
         The gripper takes the place of what the arm's own URDF has on its flange.
         """
         chosen, mount, own = config.gripper.model, config.gripper.mount, data.get("gripper")
-        name = own if chosen is None and isinstance(own, str) else chosen
-        if name is None:
+        if chosen is None and not isinstance(own, str):
             if mount is not None:
                 self.report(f"{key}.gripper.mount", "needs a gripper that model names", "missing_key")
             return data
-        base = self.base if chosen is not None else file.parent
-        found = find_file(name, "gripper model", base, "robots", "grippers")
+        found = find_file(chosen or own, "gripper model", self.base if chosen else file.parent, "robots", "grippers")
         if isinstance(found, str):
-            where = (self.source, f"{key}.gripper.model") if chosen is not None else (file, "gripper")
+            where = (self.source, f"{key}.gripper.model") if chosen else (file, "gripper")
             self.problems.add(*where, found, "unknown_model")
             return None
         before = len(self.problems.found)
         given = read_yaml(found, self.problems)
-        gripper = validate(GripperFile, given or {}, found, self.problems)
         if mount is None and "flange" in data:
             mount = validate(TcpModel, data["flange"], file, self.problems, "flange")
         elif mount is None:
             message = f"is missing: model {config.model!r} has no flange; give a link, and the pose of a flange in it"
             self.report(f"{key}.gripper.mount", message, "missing_key")
-        if given is None or mount is None or len(self.problems.found) > before:
+        gripper = None if given is None else validate(GripperFile, given, found, self.problems)
+        if gripper is None or mount is None or len(self.problems.found) > before:
             return None
         self.gripper_files[key] = found
-        flange = Pose(mount.position, mount.orientation)
-        tcp = flange @ Pose(gripper.tcp.position, gripper.tcp.orientation)
-        urdf = gripper.urdf.model_dump()
-        if gripper.urdf.package is None:
-            urdf["path"] = str(user_path(gripper.urdf.path, found.parent))
-        tool = {"urdf": urdf, "link": mount.link, "position": gripper.position, "orientation": gripper.orientation}
-        return {
-            **data,
-            "tool": {**tool, "flange": mount.model_dump(exclude={"link"})},
-            "tcp": {"link": mount.link, "position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()},
-            "links": {**(data.get("links") or {}), "hand": FLANGE},
-            "gripper": {name: value for name, value in given.items() if name in GripperModel.model_fields},
-        }
+        return data | gripper.mounted_on(mount, found.parent) | {"links": {**data.get("links", {}), "hand": FLANGE}}
 
     def choose_driver(
         self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None = None

@@ -6,12 +6,14 @@ A model of your own is a file with the same keys, which a rig names by its path.
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from ..geometry import Pose
 from ..types import STREAMS
-from .data_files import data_folder, list_data
+from .data_files import data_folder, list_data, user_path
 from .files import Problems, read_yaml
 from .schema import (
     Accelerations,
@@ -185,6 +187,20 @@ class GripperFile(GripperModel):
     """Pose of the root of the URDF in the frame of the flange."""
     tcp: PoseConfig
     """The tool centre point in the frame of the flange."""
+
+    def mounted_on(self, flange: TcpModel, folder: Path) -> dict[str, Any]:
+        """Return the keys of an arm's model that it replaces; ``folder`` is that of its file."""
+        tcp = Pose(flange.position, flange.orientation) @ Pose(self.tcp.position, self.tcp.orientation)
+        urdf = self.urdf.model_dump()
+        if self.urdf.package is None:
+            urdf["path"] = str(user_path(self.urdf.path, folder))
+        pose = {"position": self.position, "orientation": self.orientation}
+        tool = {"urdf": urdf, "link": flange.link, **pose, "flange": flange.model_dump(exclude={"link"})}
+        return {
+            "tool": tool,
+            "tcp": {"link": flange.link, "position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()},
+            "gripper": self.model_dump(include=set(GripperModel.model_fields)),
+        }
 
 
 class ToolModel(Strict):
