@@ -12,11 +12,12 @@ from time import monotonic, sleep
 from typing import Any
 
 import pytest
-from app_kit import run_here
+from app_kit import run_here, write_pad
 from robotiq_kit import FarGripper, emulated_robotiq, robotiq_overrides
 from waiting import wait_until
 
 import hal
+from hal.apps.calibrate import main as calibrate
 from hal.apps.check import main as check
 from hal.apps.replay import main as replay
 from hal.recording import Recorder
@@ -141,6 +142,18 @@ def test_the_gripper_keeps_its_grip_when_its_process_is_killed() -> None:
         with hal.open("franka_robotiq", sim=False, pad="none", clock="real_time", overrides=overrides) as rig:
             state = rig.robots["arm"].gripper.state()  # type: ignore[union-attr]
             assert (state.grasped, state.fault) == (True, None)
+
+
+def test_the_command_line_activates_a_gripper_while_the_deadman_is_held(tmp_path: Path) -> None:
+    """The arm is simulated: only the gripper is behind the wire."""
+    overrides = [*robotiq_overrides(), "robots.arm.sim=true", "robots.arm.gripper.sim=false"]
+    words = [word for value in overrides for word in ("--set", value)]
+    with emulated_robotiq(active=False) as far:
+        pad = write_pad(tmp_path, until=60.0, held=(1.0, 50.0))
+        shown = run_here(calibrate, "gripper", "--config", "franka_robotiq", "--real", *words, "--pad", pad)
+        assert shown.returncode == 0, shown.stdout + shown.stderr
+        assert "ready, 85 mm open" in shown.stdout
+        assert far.execute("state")["STA"] == 3
 
 
 class RobotiqProgram:
