@@ -1,4 +1,4 @@
-"""``hal calibrate gripper``: find the closed position of a gripper's motor while a dead-man is held."""
+"""``hal calibrate gripper``: home a gripper, or find where its motor is closed, while a dead-man is held."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ def gripper_parser() -> argparse.ArgumentParser:
     """Return the parser of ``hal calibrate gripper``."""
     made = argparse.ArgumentParser(
         prog="hal calibrate gripper",
-        description="Find where a gripper is closed, for one whose motor has its zero elsewhere. It closes slowly, "
-        "with little force, while the dead-man is held, until something stops it. The arm is not switched on. The "
-        "result is an entry for the rig file.",
+        description="Home a gripper that needs it after its power was off (Robotiq, Franka Hand), or find where one is "
+        "closed whose motor has its zero elsewhere (Damiao): that closes slowly, with little force, until something "
+        "stops it, and the result is an entry for the rig file. Both only while the dead-man is held. The arm is not "
+        "switched on.",
         epilog="An object between the fingers, or fingers that jam, cannot be told from closed fingers: take "
         "everything out, and look at them.",
     )
@@ -60,6 +61,9 @@ def find_zero(args: argparse.Namespace) -> int:
         result = close_while_held(rig, gripper, deadman)
         if result.fault is not None:
             raise hal.RobotFault(result.fault.cause, result.fault.remedy, code=result.fault.code)
+        if motor is None:
+            print(f"  ready, {1e3 * result.state.width:.0f} mm open")
+            return 0
         groups = rig.statistics().values()
         offset = next(group["grippers"][gripper.name] for group in groups if gripper.name in group["grippers"])[
             "offset"
@@ -74,15 +78,13 @@ def find_zero(args: argparse.Namespace) -> int:
     return 0
 
 
-def _find_motor(plan: Plan, args: argparse.Namespace) -> tuple[RobotSpec, dict[str, Any]]:
-    """Return the arm, and the settings of its gripper's motor. Raises NotSupported."""
+def _find_motor(plan: Plan, args: argparse.Namespace) -> tuple[RobotSpec, dict[str, Any] | None]:
+    """Return the arm, and the settings of its gripper's motor, None if it has its own zero. Raises NotSupported."""
     name = next(iter(robot_names(args)), plan.robots[0].name)
     spec = next(robot for robot in plan.robots if robot.name == name)
-    motor = None if spec.gripper is None else spec.gripper.options.get("motor")
-    if motor is None:
-        text = f"{name} has no gripper whose motor needs a zero: it is simulated, knows its own, or there is none"
-        raise NotSupported(text, code="no_gripper_motor")
-    return spec, motor
+    if spec.gripper is None or not spec.attended:
+        raise NotSupported(f"{name} has no gripper, or a simulated one, which needs no homing", code="no_real_gripper")
+    return spec, spec.gripper.options.get("motor")
 
 
 def _find_deadman(rig: Rig, spec: RobotSpec) -> Deadman:
@@ -102,7 +104,7 @@ def _find_deadman(rig: Rig, spec: RobotSpec) -> Deadman:
     if spec.attended and not spec.emulated:
         deadman.check_trust()
     name = pad.control_name(control)
-    how = f"hold {name}: the fingers close only while it is held" if pad.can_hold else f"press {name}: one step each"
+    how = f"hold {name}: the fingers move only while it is held" if pad.can_hold else f"press {name}: one step each"
     text = f"take everything out from between the fingers; then {how}"
     print(f"  {text}", flush=True)
     rig.say(text)

@@ -37,17 +37,18 @@ PROGRAMS = {
     "grasp": "find an object and grasp it",
     "push": "find an object and push it to a goal",
     "export": "convert a dataset for training",
-    "calibrate": "measure where a camera is, its lens, or where a gripper is closed",
+    "calibrate": "measure where a camera is, its lens, where a gripper is closed; home a gripper",
 }
 GROUP = "hal.apps"
 """Group of the entry points of programs that other packages have."""
 BESIDE = {
-    "emulate": ("play a Franka or arms on a CAN bus, for the real driver", "packages/emulators"),
+    "emulate": ("play a Franka, arms on a CAN bus or Robotiq grippers, for the real driver", "packages/emulators"),
     "import-ark": ("convert a configuration of Ark", "packages/import-ark"),
 }
 """Program of a package beside this one -> what it does, and the package's folder in the repository."""
 LISTS = {
     "robots": ("robots",),
+    "grippers": ("robots", "grippers"),
     "cameras": ("sensors", "cameras"),
     "rigs": ("config",),
     "pads": ("sensors", "gamepads"),

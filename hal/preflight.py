@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from . import registry
 from .errors import HalError
-from .specs import CameraSpec, RobotSpec
+from .specs import CameraSpec, GripperSpec, RobotSpec
 
 if TYPE_CHECKING:
     from .specs import Plan
@@ -38,10 +38,11 @@ class CheckResult:
     """What to do about it, a command if there is one; empty if nothing is to be done."""
 
 
+Device = RobotSpec | GripperSpec | CameraSpec
 Check = Callable[[RobotSpec, float], Iterator[CheckResult]]
 """A driver's ``DriverSpec.preflight``: its arguments are the arm's record, and how long it may measure, s."""
 CameraCheck = Callable[[CameraSpec, float], Iterator[CheckResult]]
-"""A driver's ``DriverSpec.camera_preflight``, likewise."""
+"""A driver's ``DriverSpec.camera_preflight``, likewise; ``gripper_preflight`` takes a gripper's record."""
 
 
 def preflight(
@@ -63,7 +64,9 @@ def preflight(
         yield _check_engine(plan.engine)
         if cameras:
             yield from _check_pictures(plan)
-    devices: list[RobotSpec | CameraSpec] = [*list_real_arms(plan), *(list_checked_cameras(plan) if cameras else ())]
+    arms = list_real_arms(plan)
+    grippers = [arm.gripper for arm in arms if arm.gripper is not None and _find_check(arm.gripper) is not None]
+    devices: list[Device] = [*arms, *grippers, *(list_checked_cameras(plan) if cameras else ())]
     for device in devices:
         for result in _check(device, duration):
             yield replace(result, name=f"{device.name}: {result.name}")
@@ -101,15 +104,21 @@ def _check_pictures(plan: Plan) -> Iterator[CheckResult]:
         yield CheckResult("renderer", "fail", f"{type(error).__name__}: {error}", "or open the rig without its cameras")
 
 
-def _check(device: RobotSpec | CameraSpec, duration: float) -> Iterator[CheckResult]:
-    arm = isinstance(device, RobotSpec)
+def _find_check(device: Device) -> str | None:
+    """Return the place of the check of a device's driver; None if it has none."""
+    spec = registry.driver(device.driver)
+    if isinstance(device, RobotSpec):
+        return spec.preflight
+    return spec.gripper_preflight if isinstance(device, GripperSpec) else spec.camera_preflight
+
+
+def _check(device: Device, duration: float) -> Iterator[CheckResult]:
     try:
-        spec = registry.driver(device.driver)
         check: Callable[[Any, float], Iterator[CheckResult]] | None = registry.function(
-            device.driver, spec.preflight if arm else spec.camera_preflight
+            device.driver, _find_check(device)
         )
         if check is None:
-            kind = "arm" if arm else "camera"
+            kind = "arm" if isinstance(device, RobotSpec) else "camera"
             yield CheckResult(kind, "unknown", f"its driver {device.driver!r} has no check of its own")
             return
         yield from check(device, duration)

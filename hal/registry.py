@@ -42,6 +42,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "playback": "hal.drivers.playback:DRIVER",
         "pybullet": "hal.drivers.pybullet:DRIVER",
         "realsense": "hal.drivers.realsense:DRIVER",
+        "robotiq": "hal.drivers.robotiq:DRIVER",
         "terminal": "hal.drivers.terminal:DRIVER",
         "ur": "hal.drivers.ur:DRIVER",
         "v4l2": "hal.drivers.webcam:V4L2",
@@ -115,6 +116,8 @@ class DriverSpec:
     """"module:function" that checks a real arm before it moves (see :mod:`hal.preflight`)."""
     camera_preflight: str | None = None
     """The same for a real camera."""
+    gripper_preflight: str | None = None
+    """The same for a real gripper, where the driver of its arm does not check it."""
     buses: str | None = None
     """"module:function" that yields a line for each adapter that this driver's devices can be connected to, without
     arguments; ``hal check --can`` prints them."""

@@ -17,14 +17,14 @@ from typing import Any, TypeVar
 from .. import registry
 from ..errors import HalError
 from ..geometry import Pose
-from ..kinematics.composition import MountedTool, compose_urdf
+from ..kinematics.composition import FLANGE, MountedTool, compose_urdf
 from ..kinematics.hulls import FORMATS
 from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
 from ..specs import CameraSpec, RobotSpec
 from .data_files import user_path
 from .files import Problems, find_file, leave_holes, read_yaml, suggest, validate
-from .models import CameraModel, FileSource, GripperModel, RobotModel
+from .models import CameraModel, FileSource, GripperFile, GripperModel, RobotModel, TcpModel
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
@@ -59,6 +59,8 @@ class Context:
     """Those of :attr:`emulated` that no clock can step."""
     drivers: dict[str, str] = field(default_factory=dict)
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
+    gripper_files: dict[str, Path] = field(default_factory=dict)
+    """Files of the grippers that are not part of their arm's model, by the keys of the arms in the rig."""
 
     @property
     def rig_sim(self) -> bool:
@@ -111,6 +113,8 @@ class Context:
                 data = read_yaml(found, self.problems)
                 if data is not None and isinstance(config, RobotConfig):
                     data = self._choose_arm(key, config, data)
+                    if data is not None:
+                        data = self._mount_gripper(key, config, data, found)
                 if data is not None:
                     return validate(kind, data, found, self.problems), found
             else:
@@ -131,6 +135,34 @@ class Context:
             self.report(f"{key}.arm", message, "unknown_arm")
             return None
         return {**{name: value for name, value in data.items() if name != "arms"}, **own}
+
+    def _mount_gripper(self, key: str, config: RobotConfig, data: dict[str, Any], file: Path) -> dict[str, Any] | None:
+        """Return an arm's model with the gripper that the rig or the model names; None, and a problem, if it has some.
+
+        The gripper takes the place of what the arm's own URDF has on its flange.
+        """
+        chosen, mount, own = config.gripper.model, config.gripper.mount, data.get("gripper")
+        if chosen is None and not isinstance(own, str):
+            if mount is not None:
+                self.report(f"{key}.gripper.mount", "needs a gripper that model names", "missing_key")
+            return data
+        found = find_file(chosen or own, "gripper model", self.base if chosen else file.parent, "robots", "grippers")
+        if isinstance(found, str):
+            where = (self.source, f"{key}.gripper.model") if chosen else (file, "gripper")
+            self.problems.add(*where, found, "unknown_model")
+            return None
+        before = len(self.problems.found)
+        given = read_yaml(found, self.problems)
+        if mount is None and "flange" in data:
+            mount = validate(TcpModel, data["flange"], file, self.problems, "flange")
+        elif mount is None:
+            message = f"is missing: model {config.model!r} has no flange; give a link, and the pose of a flange in it"
+            self.report(f"{key}.gripper.mount", message, "missing_key")
+        gripper = None if given is None else validate(GripperFile, given, found, self.problems)
+        if gripper is None or mount is None or len(self.problems.found) > before:
+            return None
+        self.gripper_files[key] = found
+        return data | gripper.mounted_on(mount, found.parent) | {"links": {**data.get("links", {}), "hand": FLANGE}}
 
     def choose_driver(
         self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None = None
@@ -216,7 +248,8 @@ def load_arm(model: RobotModel, file: Path, problems: Problems, warnings: list[s
         own = _locate(tool.urdf, file.parent, file, "tool.urdf", problems, (".urdf",))
         if own is None:
             return None
-        mounted = MountedTool(own, tool.link, Pose(tool.position, tool.orientation))
+        flange = None if tool.flange is None else Pose(tool.flange.position, tool.flange.orientation)
+        mounted = MountedTool(own, tool.link, Pose(tool.position, tool.orientation), flange)
     try:
         for path in (arm, *([mounted.urdf] if mounted is not None else [])):
             read_urdf(path)
@@ -372,8 +405,9 @@ def _add(
     """Add problems (key in the entry, message, code) to the rig's file, or to the model's if that has the key."""
     for relative, message, code in found:
         in_model = _find_model_key(relative, config, model, context)
+        own = context.gripper_files.get(key) if part else None
         if in_model is not None:
-            context.problems.add(file, f"{part}{in_model}", message, code)
+            context.problems.add(own or file, in_model if own else f"{part}{in_model}", message, code)
         else:
             context.report(f"{key}.{part}{relative}", message, code)
 

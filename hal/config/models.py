@@ -6,12 +6,14 @@ A model of your own is a file with the same keys, which a rig names by its path.
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from ..geometry import Pose
 from ..types import STREAMS
-from .data_files import data_folder, list_data
+from .data_files import data_folder, list_data, user_path
 from .files import Problems, read_yaml
 from .schema import (
     Accelerations,
@@ -26,6 +28,7 @@ from .schema import (
     Name,
     Offset,
     Pixels,
+    PoseConfig,
     Quantity,
     QuaternionConfig,
     RateHz,
@@ -174,6 +177,32 @@ class GripperModel(Strict):
         return (first.open - first.closed) * (far - near) * (more - less) < 0.0  # type: ignore[operator]  # both given
 
 
+class GripperFile(GripperModel):
+    """A gripper that is not part of an arm's model; a rig mounts it on the flange of an arm."""
+
+    description: str = ""
+    urdf: FileSource
+    position: Offset = (0.0, 0.0, 0.0)
+    orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+    """Pose of the root of the URDF in the frame of the flange."""
+    tcp: PoseConfig
+    """The tool centre point in the frame of the flange."""
+
+    def mounted_on(self, flange: TcpModel, folder: Path) -> dict[str, Any]:
+        """Return the keys of an arm's model that it replaces; ``folder`` is that of its file."""
+        tcp = Pose(flange.position, flange.orientation) @ Pose(self.tcp.position, self.tcp.orientation)
+        urdf = self.urdf.model_dump()
+        if self.urdf.package is None:
+            urdf["path"] = str(user_path(self.urdf.path, folder))
+        pose = {"position": self.position, "orientation": self.orientation}
+        tool = {"urdf": urdf, "link": flange.link, **pose, "flange": flange.model_dump(exclude={"link"})}
+        return {
+            "tool": tool,
+            "tcp": {"link": flange.link, "position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()},
+            "gripper": self.model_dump(include=set(GripperModel.model_fields)),
+        }
+
+
 class ToolModel(Strict):
     """A gripper or a tool with a URDF of its own, fixed to a link of the arm.
 
@@ -185,7 +214,9 @@ class ToolModel(Strict):
     """Link of the arm."""
     position: Offset = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
-    """Pose of the root of the tool in the frame of that link."""
+    """Pose of the root of the tool in the frame of that link, or of its flange."""
+    flange: PoseConfig | None = None
+    """Pose in that link of the frame ``tool_flange``. What the arm's own URDF has on the link is then left out."""
 
 
 class RobotModel(Strict):
@@ -195,6 +226,8 @@ class RobotModel(Strict):
     urdf: FileSource
     tool: ToolModel | None = None
     """What is mounted on the arm and not in its URDF."""
+    flange: TcpModel | None = None
+    """Where a gripper is mounted that a rig chooses: z points out, x forward, and fingers move along y."""
     freed: tuple[str, ...] = ()
     """Joints that the URDF has fixed, with limits, and that turn."""
     arms: dict[Name, dict[str, Any]] = Field(default_factory=dict)

@@ -26,7 +26,7 @@ from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_
 from ..registry import explain_engine
 from ..specs import ViewSpec
 from ..types import STREAMS
-from .models import Capture, Depth, Distortion, Drivers, FieldOfView, LimitsModel, expand_names
+from .models import Capture, Depth, Distortion, Drivers, FieldOfView, LimitsModel, TcpModel, expand_names
 from .randomize import RandomizeConfig
 from .schema import (
     CameraRate,
@@ -211,13 +211,22 @@ class PayloadConfig(Strict):
 
 
 class GripperConfig(Device):
-    """The model's gripper on this arm."""
+    """The gripper on this arm: the model's, or another one."""
 
+    model: str | None = None
+    """A name in ``robots/grippers/``, or the path of a file of your own; default: the arm's own gripper."""
+    mount: TcpModel | None = None
+    """Where that gripper is on the arm; default: the ``flange`` of the arm's model."""
     enabled: Flag = True
     speed: Speed | None = None
     """Speed of the width, m/s; at most the model's."""
     force: Force | None = None
     """Grip force, N."""
+
+
+def _expand_gripper(value: Any) -> Any:
+    """Return ``gripper: robotiq_2f85`` as ``{model: robotiq_2f85}``."""
+    return {"model": value} if isinstance(value, str) else value
 
 
 class RobotConfig(Device):
@@ -235,7 +244,9 @@ class RobotConfig(Device):
     """Joint positions at the start of a simulation, rad; default: home."""
     rate_hz: RateHz | None = None
     """Rate of a real arm's control cycle; default: the model's."""
-    gripper: GripperConfig = GripperConfig()
+    gripper: Annotated[GripperConfig, BeforeValidator(_expand_gripper, json_schema_input_type=GripperConfig | str)] = (
+        GripperConfig()
+    )
     speed: Share = 0.3
     """Greatest share of the joint speed limits in a control session."""
     move_speed: Share = 0.1

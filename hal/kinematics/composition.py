@@ -20,6 +20,9 @@ from .urdf import UrdfModel, parse_xml
 PREFIX = "tool_"
 """Put before each name of a tool that the arm has too."""
 
+FLANGE = "tool_flange"
+"""Frame in which a tool is mounted that takes the place of the arm's own."""
+
 LIGHT = '<inertial><mass value="0.01"/><inertia ixx="1e-6" ixy="0" ixz="0" iyy="1e-6" iyz="0" izz="1e-6"/></inertial>'
 """The mass of a tool's link that has a shape and no mass, 10 g: the pads of a gripper. Simulators make 1 kg of it."""
 
@@ -32,7 +35,9 @@ class MountedTool:
     link: str
     """Link of the arm."""
     pose: Pose
-    """Pose of the root of the tool in the frame of that link."""
+    """Pose of the root of the tool in the frame of that link, or in :data:`FLANGE`."""
+    flange: Pose | None = None
+    """Pose of :data:`FLANGE` in that link: what the arm has on the link is left out. None: there is no such frame."""
 
 
 def compose_urdf(arm: Path, tool: MountedTool | None = None, freed: Collection[str] = ()) -> Path:
@@ -124,9 +129,11 @@ def _parse_with_absolute_files(urdf: Path) -> ElementTree.Element:
 
 def _mount(root: ElementTree.Element, tool: MountedTool) -> None:
     added = _parse_with_absolute_files(tool.urdf)
-    names = {(one.tag, one.get("name", "")) for one in root}
-    if ("link", tool.link) not in names:
+    if all(one.get("name") != tool.link for one in root.findall("link")):
         raise ValueError(f"has no link {tool.link!r}")
+    if tool.flange is not None:
+        _remove_children(root, tool.link)
+    names = {(one.tag, one.get("name", "")) for one in root}
     parts = [one for one in added if one.tag in ("link", "joint", "material")]
     taken = {(one.tag, one.get("name", "")) for one in parts} & names
     for one in parts:
@@ -136,13 +143,35 @@ def _mount(root: ElementTree.Element, tool: MountedTool) -> None:
             one.append(ElementTree.fromstring(LIGHT))
     children = {one.get("link") for one in added.findall("joint/child")}
     base = next(one.get("name", "") for one in parts if one.tag == "link" and one.get("name") not in children)
-    mount = ElementTree.SubElement(root, "joint", {"name": f"{PREFIX}mount", "type": "fixed"})
-    ElementTree.SubElement(mount, "parent", {"link": tool.link})
-    ElementTree.SubElement(mount, "child", {"link": base})
-    xyz = " ".join(f"{value:.9g}" for value in tool.pose.position)
-    rpy = " ".join(f"{value:.12g}" for value in _roll_pitch_yaw(tool.pose))
-    ElementTree.SubElement(mount, "origin", {"xyz": xyz, "rpy": rpy})
+    parent = tool.link
+    if tool.flange is not None:
+        ElementTree.SubElement(root, "link", {"name": FLANGE})
+        _fix(root, f"{FLANGE}_joint", tool.link, FLANGE, tool.flange)
+        parent = FLANGE
+    _fix(root, f"{PREFIX}mount", parent, base, tool.pose)
     root.extend(parts)
+
+
+def _fix(root: ElementTree.Element, name: str, parent: str, child: str, pose: Pose) -> None:
+    """Add a fixed joint."""
+    joint = ElementTree.SubElement(root, "joint", {"name": name, "type": "fixed"})
+    ElementTree.SubElement(joint, "parent", {"link": parent})
+    ElementTree.SubElement(joint, "child", {"link": child})
+    xyz = " ".join(f"{value:.9g}" for value in pose.position)
+    rpy = " ".join(f"{value:.12g}" for value in _roll_pitch_yaw(pose))
+    ElementTree.SubElement(joint, "origin", {"xyz": xyz, "rpy": rpy})
+
+
+def _remove_children(root: ElementTree.Element, link: str) -> None:
+    """Remove all links that are fixed to a link or move on it, with their joints."""
+    for joint in root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None and parent.get("link") == link:
+            root.remove(joint)
+            _remove_children(root, child.get("link", ""))
+            for part in root.findall("link"):
+                if part.get("name") == child.get("link"):
+                    root.remove(part)
 
 
 def _rename(part: ElementTree.Element, taken: Collection[tuple[str, str]]) -> None:

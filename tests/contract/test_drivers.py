@@ -44,6 +44,7 @@ from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
 from .pads import mock_pad, playback_pad, terminal_steps, web_pad
+from .robotiqs import robotiq_gripper
 from .urs import UR5e
 from .webcams import network_camera, video_file, webcam
 
@@ -162,6 +163,16 @@ class TestEmulatedPiperGripper(GripperContract, left_out=PIPER_REPORTS):
 
 class TestEmulatedDamiaoGripper(GripperContract, left_out={"freeze": "a silent motor is lost"}):
     bench = bench_of(damiao_gripper)
+
+
+@pytest.mark.slow
+class TestEmulatedRobotiq(GripperContract, left_out={"freeze": "a gripper that does not answer is lost"}):
+    """Both ways to a gripper: Modbus RTU on a serial line, and the text port of a UR."""
+
+    @pytest.fixture(params=["serial", "text"])
+    def bench(self, request: pytest.FixtureRequest) -> Iterator[GripperBench]:
+        with robotiq_gripper(request.param) as bench:
+            yield bench
 
 
 @pytest.mark.slow

@@ -49,6 +49,11 @@ ELSEWHERE = {
         f"{WIRE}piper_rig.py::test_a_bus_that_is_cut_stops_the_program_and_comes_back",
     ),
     "a motor or joint on a CAN bus": (f"{CAN}a_fault_in_motion",),
+    "the process of a Robotiq gripper dies": (
+        f"{WIRE}robotiq.py::test_the_gripper_keeps_its_grip_when_its_process_is_killed",
+        f"{WIRE}robotiq.py::test_a_line_that_is_gone_is_known_soon_and_comes_back",
+    ),
+    "a Robotiq gripper was without power": ("tests/unit/drivers/robotiq/test_robotiq.py::test_only_home_activates",),
     "the process of a gripper dies": (
         f"{SYSTEM}gripper_process.py::test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead",
     ),

@@ -1,9 +1,13 @@
-"""Client of a running emulator's control port."""
+"""The control port and the prompt of an emulator, and the client of a running one."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
+import sys
+import threading
+from collections.abc import Callable
 from typing import Any
 
 CONTROL_PORT = 1339
@@ -55,3 +59,61 @@ class EmulatorControl:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+Execute = Callable[[str], "dict[str, Any]"]
+"""Executes a command and returns its answer. Raises ValueError if it is invalid."""
+
+
+def serve_prompt(execute: Execute) -> None:
+    """Execute the lines of standard input, in a thread, until it ends. Answers are for a reader: text, or JSON."""
+
+    def serve() -> None:
+        with contextlib.suppress(OSError, ValueError):
+            for line in sys.stdin:
+                if line.strip():
+                    answer = _answer(execute, line)
+                    report = {key: value for key, value in answer.items() if key != "ok"}
+                    print(
+                        answer.get("text") or answer.get("error") or (json.dumps(report) if report else "ok"),
+                        flush=True,
+                    )
+
+    threading.Thread(target=serve, name="prompt", daemon=True).start()
+
+
+class CommandPort:
+    """The control port: TCP on this computer, one thread for each client.
+
+    Attributes:
+        number: The port.
+    """
+
+    def __init__(self, execute: Execute, number: int = 0) -> None:
+        """Listen on a port, 0 for a free one. Raises OSError if it is taken."""
+        self._execute = execute
+        self._listener = socket.create_server(("127.0.0.1", number))
+        self.number: int = self._listener.getsockname()[1]
+        threading.Thread(target=self._accept, name="control-port", daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = self._listener.accept()
+                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError), connection, connection.makefile("r", encoding="utf-8") as lines:
+            for line in lines:
+                connection.sendall(json.dumps(_answer(self._execute, line)).encode() + b"\n")
+
+    def close(self) -> None:
+        """Close the port."""
+        self._listener.close()
+
+
+def _answer(execute: Execute, line: str) -> dict[str, Any]:
+    try:
+        return {"ok": True, **execute(line)}
+    except (ValueError, TypeError) as error:
+        return {"ok": False, "error": str(error)}

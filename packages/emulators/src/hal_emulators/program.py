@@ -4,6 +4,7 @@ hal emulate --config franka_emulator
 hal emulate franka --robot fr3
 hal emulate ur --robot ur5e
 hal emulate can --config yam_emulator
+hal emulate robotiq --config franka_robotiq
 """
 
 from __future__ import annotations
@@ -15,7 +16,12 @@ from importlib import import_module
 
 from hal.errors import HalError
 
-DEVICES = {"can": "every arm on a CAN bus of a rig", "franka": "a Franka arm and its hand", "ur": "a UR arm"}
+DEVICES = {
+    "can": "every arm on a CAN bus of a rig",
+    "franka": "a Franka arm and its hand",
+    "ur": "a UR arm",
+    "robotiq": "every Robotiq gripper of a rig",
+}
 
 
 def parser() -> argparse.ArgumentParser:

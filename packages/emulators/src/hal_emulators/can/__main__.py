@@ -16,9 +16,10 @@ except ModuleNotFoundError:
 
 from hal.errors import ControlTaken, HalError
 from hal.lock import DeviceLock
+from hal_emulators.control import CommandPort, serve_prompt
 from hal_emulators.shared_world import has_world, run_world
 
-from .console import CommandPort, help_text, serve_prompt
+from .console import help_text
 from .server import CanEmulator
 
 _PATIENCE = 1.0
@@ -66,10 +67,10 @@ def _run(options: argparse.Namespace, ends: list[int]) -> None:
         built = CanEmulator(options.config, options.set, options.seed, realtime=True, in_world=in_world)
         _lock_buses(built)
         with built as emulator:
-            port = CommandPort(emulator, options.port)
+            port = CommandPort(emulator.execute, options.port)
             names = ", ".join(f"{arm.name} at {' '.join(arm.bus.key)}" for arm in emulator.arms.values())
             print(f"ready: {names}; control port {port.number}; help lists the commands", flush=True)
-            serve_prompt(emulator)
+            serve_prompt(emulator.execute)
             while not ends:
                 time.sleep(0.1)
                 for bus in emulator.buses:

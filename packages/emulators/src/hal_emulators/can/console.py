@@ -6,14 +6,9 @@ this computer only; a line holds a command, and its answer is a line of JSON.
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
 import os
 import signal
-import socket
-import sys
-import threading
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -285,60 +280,3 @@ def execute(emulator: CanEmulator, words: list[str]) -> dict[str, Any]:
     except (ValueError, IndexError) as error:
         reason = f"usage: {command.usage}" if isinstance(error, IndexError) else error
         raise ValueError(f"{verb}: {reason}") from None
-
-
-# Prompt and control port.
-
-
-def serve_prompt(emulator: CanEmulator) -> None:
-    """Execute the lines of standard input, in a thread, until it ends. Answers are for a reader: text, or JSON."""
-
-    def serve() -> None:
-        with contextlib.suppress(OSError, ValueError):
-            for line in sys.stdin:
-                if line.strip():
-                    answer = _answer(emulator, line)
-                    report = {key: value for key, value in answer.items() if key != "ok"}
-                    print(
-                        answer.get("text") or answer.get("error") or (json.dumps(report) if report else "ok"),
-                        flush=True,
-                    )
-
-    threading.Thread(target=serve, name="prompt", daemon=True).start()
-
-
-class CommandPort:
-    """The control port: TCP on this computer, one thread for each client.
-
-    Attributes:
-        number: The port.
-    """
-
-    def __init__(self, emulator: CanEmulator, number: int = 0) -> None:
-        """Listen on a port, 0 for a free one. Raises OSError if it is taken."""
-        self._emulator = emulator
-        self._listener = socket.create_server(("127.0.0.1", number))
-        self.number: int = self._listener.getsockname()[1]
-        threading.Thread(target=self._accept, name="control-port", daemon=True).start()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                connection, _ = self._listener.accept()
-                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
-
-    def _serve(self, connection: socket.socket) -> None:
-        with contextlib.suppress(OSError), connection, connection.makefile("r", encoding="utf-8") as lines:
-            for line in lines:
-                connection.sendall(json.dumps(_answer(self._emulator, line)).encode() + b"\n")
-
-    def close(self) -> None:
-        """Close the port."""
-        self._listener.close()
-
-
-def _answer(emulator: CanEmulator, line: str) -> dict[str, Any]:
-    try:
-        return {"ok": True, **execute(emulator, line.split())}
-    except (ValueError, TypeError) as error:
-        return {"ok": False, "error": str(error)}

@@ -1,0 +1,51 @@
+"""The emulator as a program: ``hal emulate robotiq --config franka_robotiq``."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from collections.abc import Sequence
+
+from hal.errors import HalError
+from hal_emulators.control import CommandPort, serve_prompt
+
+from .server import RobotiqEmulator, find_grippers, help_text
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program, and return its exit status."""
+    parser = argparse.ArgumentParser(
+        prog="hal emulate robotiq",
+        description="Emulates every Robotiq gripper of a rig, on a pseudo terminal with the name of its port, or on "
+        "the text port of its host. What the manual leaves open is assumed; it proves nothing about a real gripper.",
+        epilog="commands, typed here or sent to the control port; with several grippers, the arm's name first:\n"
+        + help_text(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
+    parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
+    options = parser.parse_args(arguments)
+    ends: list[int] = []  # not an Event: a second signal within its set() would wait for ever
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _: ends.append(number))
+    try:
+        with RobotiqEmulator(find_grippers(options.config, options.set), options.seed) as emulator:
+            control = CommandPort(emulator.execute, options.port)
+            places = ", ".join(f"{arm} at {port.gripper.settings.place}" for arm, port in emulator.ports.items())
+            print(f"ready: {places}; control port {control.number}; help lists the commands", flush=True)
+            serve_prompt(emulator.execute)
+            while not ends:
+                time.sleep(0.1)
+            control.close()
+    except (HalError, OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,193 @@
+"""The other end of a gripper's line: a pseudo terminal with Modbus RTU, or the text port; with faults on the way."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import re
+import socket
+import struct
+import tty
+from pathlib import Path
+from time import monotonic
+
+from hal.drivers.robotiq.link import TEXT_PORT, Request, crc16
+from hal.drivers.robotiq.settings import EMULATED
+
+from .gripper import EmulatedGripper
+
+__all__ = ["Port", "SerialPort", "TextPort"]
+
+
+class Port:
+    """The faults that both kinds of line have; times are on the monotonic clock, s."""
+
+    def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:
+        self.gripper = gripper
+        self.silent_until = self.out_until = self.delay = self.lost_share = 0.0
+        self.lose_next = self.garble_next = 0
+        self._random = random.Random(seed)
+        self._late: list[tuple[float, int, bytes]] = []
+        self._came: dict[int, bytes] = {}
+
+    def open(self) -> None:
+        """Offer the line. Raises OSError."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Take the line away, as if it was unplugged."""
+        raise NotImplementedError
+
+    def descriptors(self) -> list[int]:
+        """Return what to read from; none while the line is away."""
+        raise NotImplementedError
+
+    def answer(self, came: bytes) -> tuple[bytes, bytes]:
+        """Return what is left of the bytes that have come, and the answer to the rest."""
+        raise NotImplementedError
+
+    def serve(self, descriptor: int) -> bool:
+        """Take what has come; return whether there is still a client."""
+        try:
+            came = os.read(descriptor, 4096)
+        except OSError:
+            came = b""
+        if not came:
+            self._came.pop(descriptor, None)
+            return False
+        now = monotonic()
+        if now < self.silent_until or not self.gripper.powered:
+            return True
+        self._came[descriptor], answer = self.answer(self._came.get(descriptor, b"") + came)
+        if self.lose_next or self._random.random() < self.lost_share:
+            self.lose_next = max(0, self.lose_next - 1)
+        elif answer:
+            if self.garble_next:
+                self.garble_next -= 1
+                answer = answer[:-1] + bytes((answer[-1] ^ 0x55,))
+            self._late.append((now + self.delay, descriptor, answer))
+        return True
+
+    def send_due(self, now: float) -> None:
+        """Send the answers that are due, and let power and line come back."""
+        if not self.gripper.powered and now >= self.gripper.on_at:
+            self.gripper.powered = True
+            self.gripper.switch_on()
+        if (now < self.out_until) == bool(self.descriptors()):
+            (self.close if self.descriptors() else self.open)()
+        while self._late and self._late[0][0] <= now:
+            _, descriptor, answer = self._late.pop(0)
+            with contextlib.suppress(OSError):
+                os.write(descriptor, answer)
+
+
+class SerialPort(Port):
+    """Modbus RTU on a pseudo terminal, to which the name of the port leads."""
+
+    def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:
+        super().__init__(gripper, seed)
+        self._link = Path(str(gripper.settings.port))
+        self._ends: tuple[int, ...] = ()
+        if self._link.suffix != EMULATED or (self._link.exists() and not self._link.is_symlink()):
+            raise ValueError(
+                f"the port of an emulated gripper is a free path that ends in {EMULATED}, not {self._link}"
+            )
+
+    def open(self) -> None:
+        self._ends = os.openpty()  # while its other end is open here too, it outlives its clients
+        tty.setraw(self._ends[1])
+        self._link.unlink(missing_ok=True)
+        self._link.symlink_to(os.ttyname(self._ends[1]))
+
+    def close(self) -> None:
+        for end in self._ends:
+            os.close(end)
+        self._ends, self._late, self._came = (), [], {}
+        self._link.unlink(missing_ok=True)
+
+    def descriptors(self) -> list[int]:
+        return list(self._ends[:1])
+
+    def answer(self, came: bytes) -> tuple[bytes, bytes]:
+        answers = b""
+        while len(came) >= 8:
+            size = 9 + came[6] if came[1] == 16 else 8
+            if len(came) < size:
+                break
+            frame, came = came[:size], came[size:]
+            if crc16(frame[:-2]) != frame[-2:]:
+                return b"", answers  # the rest is no whole frame either
+            if frame[0] == self.gripper.settings.slave:
+                reply = frame[:1] + self._execute(frame[1], frame[2:-2])
+                answers += reply + crc16(reply)
+        return came, answers
+
+    def _execute(self, function: int, data: bytes) -> bytes:
+        """Return the answer to a function: without address and check."""
+        start, count = struct.unpack_from(">HH", data)
+        if function in (3, 4):
+            act, gto, state, found, fault, echo, position = self.gripper.read()
+            bits = act | gto << 3 | state << 4 | found << 6
+            registers = bytes((bits, 0, fault, echo, position, round(self.gripper.force / 5.0)))
+            first = 2 * (start - 0x07D0)
+            values = registers[max(0, first) : first + 2 * count]
+            if first >= 0 and len(values) == 2 * count:
+                return bytes((function, len(values))) + values
+        elif function == 16:
+            values = data[5:]
+            if start == 0x03E8 and len(values) == 6 and count == 3:
+                self.gripper.take(Request(values[0] & 1, values[0] >> 3 & 1, *values[3:]))
+                return bytes((function,)) + data[:4]
+        else:
+            return bytes((function | 0x80, 1))
+        return bytes((function | 0x80, 2))
+
+
+class TextPort(Port):
+    """The text port of Robotiq's URCap; its answers have no end of line."""
+
+    _VARIABLES = ("ACT", "GTO", "STA", "OBJ", "FLT", "PRE", "POS")
+
+    def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:
+        super().__init__(gripper, seed)
+        self._door: socket.socket | None = None
+        self._clients: dict[int, socket.socket] = {}
+
+    def open(self) -> None:
+        self._door = socket.create_server((str(self.gripper.settings.host), TEXT_PORT))
+
+    def close(self) -> None:
+        for one in (self._door, *self._clients.values()):
+            if one is not None:
+                one.close()
+        self._door, self._clients, self._late, self._came = None, {}, [], {}
+
+    def descriptors(self) -> list[int]:
+        return [] if self._door is None else [self._door.fileno(), *self._clients]
+
+    def serve(self, descriptor: int) -> bool:
+        assert self._door is not None
+        if descriptor == self._door.fileno():
+            client, _ = self._door.accept()
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._clients[client.fileno()] = client
+        elif not super().serve(descriptor):
+            self._clients.pop(descriptor).close()
+        return True
+
+    def answer(self, came: bytes) -> tuple[bytes, bytes]:
+        *lines, left = came.split(b"\n")
+        return left, b"".join(self._execute(line.decode(errors="replace").split()) for line in lines)
+
+    def _execute(self, words: list[str]) -> bytes:
+        if words[:1] == ["GET"] and words[1:2] and words[1] in self._VARIABLES:
+            value = self.gripper.read()[self._VARIABLES.index(words[1])]
+            return f"{words[1]} {value}".encode()
+        pairs = dict(zip(words[1::2], words[2::2], strict=False))
+        names = {"ACT": "act", "GTO": "gto", "POS": "pr", "SPE": "sp", "FOR": "fr"}
+        if words[:1] != ["SET"] or not all(re.fullmatch(r"\d{1,3}", value) for value in pairs.values()):
+            return b"?"
+        request = {names[name]: min(255, int(value)) for name, value in pairs.items() if name in names}
+        self.gripper.take(self.gripper.request._replace(**request))
+        return b"ack"

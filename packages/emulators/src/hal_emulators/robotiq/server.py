@@ -1,0 +1,203 @@
+"""The emulator at work: one thread moves the grippers of a rig in real time, and answers; commands inject faults.
+
+with RobotiqEmulator("fr3_robotiq") as emulator:
+    emulator.execute("object 0.03")           # from any thread
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from time import monotonic
+from typing import Any, NamedTuple
+
+from hal.config.loader import load
+from hal.specs import GripperSpec
+
+from .gripper import EmulatedGripper
+from .ports import Port, SerialPort, TextPort
+
+__all__ = ["COMMANDS", "RobotiqEmulator", "find_grippers", "help_text"]
+
+_STEP = 0.002
+"""Longest step of the fingers, s."""
+_LONGEST_GAP = 0.25
+"""Time that the fingers make up for after the machine had no time for them, s."""
+_FOREVER = 1e9
+
+
+def find_grippers(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[GripperSpec]:
+    """Return the grippers of a rig that this emulator can play. Raises ConfigError and ValueError."""
+    robots = load(config, sim=False, overrides=overrides).resolve().robots
+    found = [robot.gripper for robot in robots if robot.gripper is not None and robot.gripper.driver == "robotiq"]
+    if not found:
+        raise ValueError("this rig has no Robotiq gripper that is not simulated")
+    return found
+
+
+class RobotiqEmulator:
+    """Emulated grippers, each on its line.
+
+    Attributes:
+        ports: Their lines, by the name of the arm.
+        paced: Whether the fingers move in real time; otherwise only by :meth:`advance`.
+    """
+
+    def __init__(self, grippers: Iterable[GripperSpec], seed: int = 0, paced: bool = True) -> None:
+        made = [EmulatedGripper(spec) for spec in grippers]
+        self.ports: dict[str, Port] = {
+            one.spec.arm: (SerialPort if one.settings.port is not None else TextPort)(one, seed) for one in made
+        }
+        self.paced = paced
+        self.lock = threading.Lock()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="robotiq-emulator", daemon=True)
+
+    def advance(self, seconds: float) -> None:
+        """Move the fingers by ``seconds`` at once."""
+        with self.lock:
+            self._advance(seconds)
+
+    def _advance(self, seconds: float) -> None:
+        left = min(seconds, _LONGEST_GAP)
+        while left > 1e-9:
+            dt = min(left, _STEP)
+            left -= dt
+            for port in self.ports.values():
+                port.gripper.advance(dt)
+
+    def _serve(self) -> None:
+        before = monotonic()
+        while not self._end.is_set():
+            with self.lock:
+                now = monotonic()
+                if self.paced:
+                    self._advance(now - before)
+                before = now
+                for port in self.ports.values():
+                    port.send_due(now)
+                owners = {line: port for port in self.ports.values() for line in port.descriptors()}
+            ready, _, _ = select.select(list(owners), [], [], _STEP)
+            with self.lock:
+                for descriptor in ready:
+                    if descriptor in owners[descriptor].descriptors():  # no command took it away meanwhile
+                        owners[descriptor].serve(descriptor)
+                for port in self.ports.values():
+                    port.send_due(monotonic())
+
+    def execute(self, line: str) -> dict[str, Any]:
+        """Execute a command, and return its answer; with several grippers the arm's name is its first word.
+
+        Raises:
+            ValueError: It is invalid.
+        """
+        words = line.split()
+        port = self.ports[words.pop(0)] if words and words[0] in self.ports else next(iter(self.ports.values()))
+        command = COMMANDS.get(words[0] if words else "")
+        if command is None:
+            raise ValueError(f"there is no command {' '.join(words[:1])!r}; help lists them")
+        try:
+            with self.lock:
+                return command.run(port, words[1:]) or {}
+        except (ValueError, IndexError):
+            raise ValueError(f"usage: {command.usage}") from None
+
+    def start(self) -> None:
+        """Offer all lines. Raises OSError."""
+        for port in self.ports.values():
+            port.open()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Take all lines away."""
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+        for port in self.ports.values():
+            port.close()
+
+    def __enter__(self) -> RobotiqEmulator:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+# Commands.
+
+
+class _Command(NamedTuple):
+    usage: str
+    meaning: str
+    run: Callable[[Port, list[str]], dict[str, Any] | None]
+
+
+def _end(word: str) -> float:
+    """Return the time at which a fault ends."""
+    return {"on": monotonic() + _FOREVER, "off": 0.0}[word] if word in ("on", "off") else monotonic() + float(word)
+
+
+def _set(name: str, read: Callable[[str], Any]) -> Callable[[Port, list[str]], None]:
+    return lambda port, words: setattr(port, name, read(words[0]))
+
+
+def _lose(port: Port, words: list[str]) -> None:
+    if words[0] == "next":
+        port.lose_next = int(words[1])
+    else:
+        port.lost_share = float(words[0])
+
+
+def _power(port: Port, words: list[str]) -> None:
+    port.gripper.powered = False
+    port.gripper.on_at = _end(words[0] if words else "0.5")
+
+
+def _state(port: Port, _: list[str]) -> dict[str, Any]:
+    gripper = port.gripper
+    names = ("ACT", "GTO", "STA", "OBJ", "FLT", "PRE", "POS")
+    return {**dict(zip(names, gripper.read(), strict=True)), "width": gripper.width, "force": gripper.force}
+
+
+def _reset(port: Port, _: list[str]) -> None:
+    port.silent_until = port.out_until = port.delay = port.lost_share = 0.0
+    port.lose_next = port.garble_next = 0
+    port.gripper.blocked = False
+
+
+COMMANDS = {
+    "object": _Command(
+        "object M|none",
+        "put an object of this width between the fingers",
+        lambda port, words: port.gripper.put(None if words[0] == "none" else float(words[0])),
+    ),
+    "fault": _Command(
+        "fault CODE", "raise a fault, hex: 8 to F; 0 ends it", lambda p, w: p.gripper.fail(int(w[0], 16))
+    ),
+    "block": _Command(
+        "block on|off",
+        "hold the fingers, so that an activation fails",
+        lambda port, words: setattr(port.gripper, "blocked", words[0] == "on"),
+    ),
+    "power": _Command("power [S|on|off]", "switch its power off for 0.5 s, for S, for good, or on again", _power),
+    "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", _end)),
+    "silent": _Command("silent S|on|off", "neither hear nor answer", _set("silent_until", _end)),
+    "late": _Command("late S", "send answers S seconds late", _set("delay", float)),
+    "lose": _Command("lose P | next N", "lose that share of the answers, or exactly the next N", _lose),
+    "garble": _Command("garble N", "spoil the check of the next N answers", _set("garble_next", int)),
+    "state": _Command("state", "registers, width (m), force (N)", _state),
+    "reset": _Command("reset", "end all faults of the line, and `block`", _reset),
+    "kill": _Command("kill", "end this program at once", lambda _, __: os.kill(os.getpid(), signal.SIGKILL)),
+    "help": _Command("help", "this table", lambda _, __: {"text": help_text()}),
+}
+
+
+def help_text() -> str:
+    """Return the table of commands."""
+    width = max(len(command.usage) for command in COMMANDS.values())
+    return "\n".join(f"  {command.usage:{width}}  {command.meaning}" for command in COMMANDS.values())
