@@ -39,6 +39,8 @@ _NEAR, _FAR = 0.01, 100.0
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Options of ``mallopt``, of glibc's malloc.h."""
 _REMEDY = "apt install libegl1 libgl1-mesa-dri"
+_TEXTURES = 64
+"""Number of textures that are kept although nothing shows them."""
 _COARSE_PIXELS = 6.0
 """A link is drawn coarsely where the omitted details are smaller than so many pixels: a whole arm in a picture of
 256 x 256 from 1 m on, in one of 640 x 480 from 2.5 m on."""
@@ -84,10 +86,8 @@ class _Drawable(NamedTuple):
     indices: Any
     layout: tuple[str, ...]
     texture: Any
-    arrays: dict[tuple[str, ...] | str, Any]
+    arrays: dict[tuple[str, ...], Any]
     """Its vertex array for each program."""
-    buffers: list[Any]
-    """Further buffers that its arrays use."""
 
 
 class _Program(NamedTuple):
@@ -143,6 +143,8 @@ class GLRenderer(Renderer):
         self._targets: dict[tuple[int, int, tuple[str, ...]], _Target] = {}
         self._programs: dict[tuple[str, ...], _Program] = {}
         self._shadows: ShadowMap | None = None
+        self._cast: int | None = None
+        """Revision of the parts that cast shadows."""
         self._backdrop: Backdrop | None = None
 
     def render(self, camera: CameraSpec, T_world_camera: Pose) -> RenderedImages:
@@ -176,6 +178,7 @@ class GLRenderer(Renderer):
         for gone in self._bodies.values():
             _release(gone)
         self._bodies = present
+        self._drop_textures()
         self._drawables = [drawable for body in present.values() for drawable in body.drawables]
         parts = [drawable.part for drawable in self._drawables]
         places = [(part.body, part.link) for part in parts]
@@ -187,6 +190,15 @@ class GLRenderer(Renderer):
         for link, cell in zip(self._link_of[self._coarse], (p.mesh.cell for p in parts if p.coarse), strict=True):
             self._cells[link] = cell if np.isinf(self._cells[link]) else max(cell, self._cells[link])
         self._revision = self._scene.revision
+
+    def _drop_textures(self) -> None:
+        """Release what nothing shows any more, where there are many: each episode may bring others from files."""
+        used = {id(drawable.texture) for body in self._bodies.values() for drawable in body.drawables}
+        for key in list(self._textures) if len(self._textures) > _TEXTURES else ():
+            texture, _ = self._textures[key]
+            if id(texture) not in used:
+                texture.release()
+                del self._textures[key]
 
     def _upload(self, part: DrawnPart) -> _Drawable:
         mesh = part.mesh
@@ -200,7 +212,7 @@ class GLRenderer(Renderer):
         rows = np.concatenate([np.ascontiguousarray(c).view(np.uint8).reshape(len(c), -1) for c in columns], axis=1)
         vertices = self._context.buffer(rows.tobytes())
         indices = self._context.buffer(np.ascontiguousarray(mesh.faces, np.uint32).tobytes())
-        return _Drawable(part, vertices, indices, layout, texture, {}, [])
+        return _Drawable(part, vertices, indices, layout, texture, {})
 
     def _texture(self, image: NDArray[np.uint8], repeated: bool) -> Any:
         if id(image) not in self._textures:
@@ -289,12 +301,12 @@ class GLRenderer(Renderer):
         """Return the matrix (4, 4) from the world to the shadow map, which shows the present state of the world."""
         if self._shadows is None:
             self._shadows = ShadowMap(self._context)
-        # Of a link that has coarse parts, these cast the shadow.
-        cast = self._coarse | np.isinf(self._cells)[self._link_of]
-        numbers = np.flatnonzero(cast)
-        key = (self._revision, direction.tobytes(), frames.tobytes())
-        casters = [self._drawables[number] for number in numbers]
-        return self._shadows.draw(key, direction, casters, frames[self._link_of[numbers]], self._balls[numbers])
+        if self._cast != self._revision:
+            # Of a link that has coarse parts, these cast the shadow.
+            cast = np.flatnonzero(self._coarse | np.isinf(self._cells)[self._link_of])
+            self._shadows.load([self._drawables[number].part for number in cast], self._link_of[cast])
+            self._cast = self._revision
+        return self._shadows.draw(direction, frames)
 
     def _draw_backdrop(self, look: Look, target: _Target, lens: Array, pose: Pose, gain: float) -> None:
         if self._backdrop is None:
@@ -364,8 +376,8 @@ def _release(body: _Body | None) -> None:
     for drawable in body.drawables if body else ():
         for array in drawable.arrays.values():
             array.release()
-        for buffer in (drawable.vertices, drawable.indices, *drawable.buffers):
-            buffer.release()
+        drawable.vertices.release()
+        drawable.indices.release()
 
 
 # --- where OpenGL draws to --------------------------------------------------------------------------------------------
