@@ -9,13 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from .shapes import DrawnPart
 
 __all__ = ["BACKGROUND", "Backdrop", "Light", "Look", "ShadowMap"]
 
@@ -80,8 +77,8 @@ class ShadowMap:
         self.offset = 0.0
         """Distance from a surface at which its shadow is looked up, m."""
 
-    def load(self, parts: Sequence[DrawnPart], links: NDArray[np.int64]) -> None:
-        """Take the parts that cast shadows, and the numbers (N,) of their links."""
+    def load(self, parts: Sequence[Any], links: NDArray[np.int64]) -> None:
+        """Take what casts shadows, each a :class:`.shapes.DrawnPart`, and the numbers (N,) of their links."""
         small = [number for number, part in enumerate(parts) if part.radius <= _LARGE]
         outlines = [parts[number].outline for number in small]
         sizes = [len(points) for points, _ in outlines]

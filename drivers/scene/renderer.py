@@ -436,7 +436,7 @@ class _Target:
         self._all = context.framebuffer(layers, depth)
         self._open: Any = self._all.color_mask
         one, none = (True,) * 4, (False,) * 4
-        self._masks = {name: one for name in streams}
+        self._masks = dict.fromkeys(streams, one)
         if len(streams) > 1:
             self._masks = {name: [one if other == name else none for other in streams] for name in streams}
         self._lit = {
