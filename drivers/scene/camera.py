@@ -163,8 +163,8 @@ class SimulatedPictures(CameraRenderer):
         self._description = ""
         if isinstance(host, LocalHost):
             self._mirror = LocalMirror(host.cycle.world)
-            self.notes = tuple(self._mirror.drawn.notes)
             self._renderer = choose_renderer(self._mirror.drawn, renderer)
+            self.notes = tuple(_list_notes(self._mirror.drawn, self._renderer))
             self._description = self._renderer.description
         elif isinstance(host, RemoteHost):
             self._memory = SharedMemory(frame_rings_size(cameras))
@@ -298,7 +298,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         worker.warm_up()
-    notes = list(dict.fromkeys([*drawn.notes, *(str(warning.message) for warning in caught)]))
+    notes = list(dict.fromkeys([*_list_notes(drawn, renderer), *(str(warning.message) for warning in caught)]))
     channel.send({"ready": {"renderer": renderer.description, "notes": notes}})
 
     def draw() -> float:
@@ -339,6 +339,20 @@ def choose_renderer(scene: RenderScene, name: str = "auto") -> Renderer:
         raise
     renderer.description += reason
     return renderer
+
+
+def _list_notes(drawn: DrawnWorld, renderer: Renderer) -> list[str]:
+    """Return messages for the user: what is not drawn as the rig and its files describe it."""
+    ranges = drawn.spec.randomize.variations if drawn.spec.randomize is not None else ()
+    kinds = {word for item in ranges for word in (item.key.split(".")[0], item.key.split(".")[-1])}
+    constant = [word for word in ("light", "background", "texture", "exposure") if word in kinds]
+    if not constant or isinstance(renderer, GLRenderer):
+        return drawn.notes
+    return [
+        *drawn.notes,
+        f"simulation.randomize: {', '.join(constant)}: without effect, as only OpenGL draws them; these pictures are "
+        f"drawn by {renderer.description}",
+    ]
 
 
 def check_pictures(plan: Plan) -> Iterator[CheckResult]:

@@ -7,7 +7,7 @@ a graphics card needs time for each of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,8 +22,6 @@ _SIDE = 512
 """Side of the shadow map, texels."""
 _WIDEST = 2.0
 """Greatest radius of the space in which shadows are drawn, m: its texels are 8 mm large."""
-_CELLS = 6
-"""Size of the details of a part that its shadow has, as a share of the part's radius: one of so many."""
 _STEP = 0.25
 """The space of the shadows grows and moves in steps of this size, m, so that their edges stand still."""
 _LARGE = 2.0
@@ -70,35 +68,57 @@ class ShadowMap:
         self._texture.repeat_x = self._texture.repeat_y = False
         self._target = context.framebuffer(depth_attachment=self._texture)
         self._program = context.program(vertex_shader=_SHADOW_VERTEX, fragment_shader="#version 330\nvoid main() {}\n")
+        self._array: Any = None
+        self._buffers: list[Any] = []
         self._shown: tuple[Any, ...] = ()
         self._to_light = np.eye(4)
         self.offset = 0.0
         """Distance from a surface at which its shadow is looked up, m."""
 
-    def draw(
-        self, key: tuple[Any, ...], direction: Array, casters: Iterable[Any], frames: Array, balls: Array
-    ) -> Array:
-        """Draw the depths, unless they are those of ``key``; return the matrix (4, 4) from the world to the map, 0..1.
+    def load(self, parts: Sequence[Any], links: NDArray[np.int64]) -> None:
+        """Take what casts shadows, each a :class:`.shapes.DrawnPart`, and the numbers (N,) of their links."""
+        small = [number for number, part in enumerate(parts) if part.radius <= _LARGE]
+        outlines = [parts[number].outline for number in small]
+        sizes = [len(points) for points, _ in outlines]
+        self._links = np.asarray(links, int)[small]
+        self._balls = np.array([[*parts[n].centre, 1.0, parts[n].radius] for n in small]).reshape(-1, 5)
+        self._part_of = np.repeat(np.arange(len(small)), sizes)
+        self._points = np.ones((sum(sizes), 4), np.float32)
+        for item in (self._array, *self._buffers) if self._buffers else ():
+            item.release()
+        self._array, self._buffers, self._shown = None, [], ()
+        if small:
+            self._points[:, :3] = np.concatenate([points for points, _ in outlines])
+            starts = np.cumsum([0, *sizes[:-1]])
+            faces = np.concatenate([faces + start for (_, faces), start in zip(outlines, starts, strict=True)])
+            vertices = self._context.buffer(reserve=12 * len(self._points), dynamic=True)
+            indices = self._context.buffer(faces.astype(np.uint32).tobytes())
+            self._buffers = [vertices, indices]
+            self._array = self._context.vertex_array(self._program, [(vertices, "3f4", "position")], indices)
+
+    def draw(self, direction: Array, frames: Array) -> Array:
+        """Draw the depths, unless they are those that were drawn last.
 
         Args:
-            key: What the depths depend on.
             direction: (3,) unit vector towards the light, in the world.
-            casters: What is drawn of the scene, see :class:`.renderer.GLRenderer`.
-            frames: Their poses (N, 4, 4) in the world.
-            balls: (N, 5) centre, 1 and radius of a ball around each, in its own frame, m.
+            frames: Poses (N, 4, 4) of all links in the world.
+
+        Returns:
+            The matrix (4, 4) from the world to the map, 0..1.
         """
+        key = direction.tobytes(), frames.tobytes()
         if key == self._shown:
             return self._to_light
-        centres = np.einsum("nij,nj->ni", frames[:, :3], balls[:, :4])
-        to_clip = self._fit(direction, centres, balls[:, 4])
-        matrices = np.ascontiguousarray((to_clip @ frames).transpose(0, 2, 1), np.float32)
+        frames = frames[self._links]
+        to_clip = self._fit(direction, np.einsum("nij,nj->ni", frames[:, :3], self._balls[:, :4]), self._balls[:, 4])
         self._target.clear(depth=1.0)
-        self._target.use()
-        self._context.enable_only(self._context.DEPTH_TEST)
-        for drawable, matrix, radius in zip(casters, matrices, balls[:, 4], strict=True):
-            if radius <= _LARGE:
-                self._program["to_clip"].write(matrix)
-                self._array(drawable).render()
+        if self._array is not None:  # in one call, with points that are placed here: there are few of them
+            matrices = (to_clip @ frames)[:, :3].astype(np.float32)
+            placed = np.einsum("nij,nj->ni", matrices[self._part_of], self._points)
+            self._buffers[0].write(np.ascontiguousarray(placed))
+            self._target.use()
+            self._context.enable_only(self._context.DEPTH_TEST | self._context.CULL_FACE)
+            self._array.render()
         half = np.diag([0.5, 0.5, 0.5, 1.0])
         half[:3, 3] = 0.5
         self._to_light, self._shown = half @ to_clip, key
@@ -106,10 +126,9 @@ class ShadowMap:
 
     def _fit(self, direction: Array, centres: Array, radii: Array) -> Array:
         """Return the projection (4, 4) from the world to clip space that has all casters in it."""
-        cast = radii <= _LARGE
         low, high = np.zeros(3), np.zeros(3)
-        if cast.any():
-            low, high = (centres - radii[:, None])[cast].min(axis=0), (centres + radii[:, None])[cast].max(axis=0)
+        if len(radii):
+            low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
         low, high = np.floor(low / _STEP) * _STEP, np.ceil(high / _STEP) * _STEP
         middle, radius = (low + high) / 2.0, float(np.clip(np.linalg.norm(high - low) / 2.0, _STEP, _WIDEST))
         self.offset = _OFFSET * 2.0 * radius / _SIDE
@@ -123,42 +142,14 @@ class ShadowMap:
         matrix[2, 3] = -matrix[2, :3] @ middle
         return matrix
 
-    def _array(self, drawable: Any) -> Any:
-        known = drawable.arrays.get("shadow")
-        if known is None:
-            mesh = drawable.part.mesh
-            points = _coarsen(mesh.positions, mesh.faces, drawable.part.radius / _CELLS)
-            if not len(points):  # a rod, or what is so flat that it has no cell of its own
-                points = np.ascontiguousarray(mesh.positions[mesh.faces], np.float32)
-            buffer = self._context.buffer(points.tobytes())
-            content = [(buffer, "3f4", "position")]
-            known = drawable.arrays["shadow"] = self._context.vertex_array(self._program, content)
-            drawable.buffers.append(buffer)
-        return known
-
     def use(self, place: int) -> None:
         """Make the map the texture of this number."""
         self._texture.use(place)
 
 
-def _coarsen(positions: NDArray[np.float32], faces: NDArray[np.uint32], cell: float) -> NDArray[np.float32]:
-    """Return the corners (F, 3, 3) of the triangles that are left when all corners within a cell, m, become one."""
-    _, place = np.unique(np.floor(positions / cell).astype(np.int64), axis=0, return_inverse=True)
-    place = place.reshape(-1)
-    counts = np.bincount(place)
-    middle = np.stack([np.bincount(place, positions[:, k]) / counts for k in range(3)], axis=1)
-    corners = place[faces]
-    left = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    ordered = np.sort(corners[left], axis=1)
-    _, first = np.unique(ordered, axis=0, return_index=True)
-    result: NDArray[np.float32] = middle[corners[left][first]].astype(np.float32)
-    return result
-
-
 _SHADOW_VERTEX = """#version 330
-uniform mat4 to_clip;
 in vec3 position;
-void main() { gl_Position = to_clip * vec4(position, 1.0); }
+void main() { gl_Position = vec4(position, 1.0); }
 """
 
 

@@ -6,11 +6,14 @@ physics engine: what is drawn is a :class:`.scene.RenderScene`.
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +34,11 @@ LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue (ITU-R BT.601)."""
 _NEAR, _FAR = 0.01, 100.0
 """Range of what is drawn, m. A camera's own range only blanks its depth."""
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+"""Options of ``mallopt``, of glibc's malloc.h."""
 _REMEDY = "apt install libegl1 libgl1-mesa-dri"
+_TEXTURES = 64
+"""Number of textures that are kept although nothing shows them."""
 _COARSE_PIXELS = 6.0
 """A link is drawn coarsely where the omitted details are smaller than so many pixels: a whole arm in a picture of
 256 x 256 from 1 m on, in one of 640 x 480 from 2.5 m on."""
@@ -77,10 +84,18 @@ class _Drawable(NamedTuple):
     indices: Any
     layout: tuple[str, ...]
     texture: Any
-    arrays: dict[tuple[str, ...] | str, Any]
+    arrays: dict[tuple[str, ...], Any]
     """Its vertex array for each program."""
-    buffers: list[Any]
-    """Further buffers that its arrays use."""
+
+
+class _Program(NamedTuple):
+    """A program for a set of streams and a kind of light, with its uniforms; None for those that it does not have."""
+
+    key: tuple[str, ...]
+    program: Any
+    to_clip: Any
+    model_view: Any
+    body: Any
 
 
 class _Body(NamedTuple):
@@ -111,6 +126,7 @@ class GLRenderer(Renderer):
         self._lock = threading.Lock()
         self._context = create_context()
         self.description = f"OpenGL on {self._context.info['GL_RENDERER']}"
+        self._light_block = self._context.buffer(reserve=16 * _LIGHT_ROWS)
         self._context.__exit__(None, None, None)  # current in no thread, so that any thread may draw
         self._bodies: dict[int, _Body] = {}
         self._revision: int | None = None
@@ -123,8 +139,10 @@ class GLRenderer(Renderer):
         """Size of the details that the coarse parts of each link leave out, m; infinite where it has none."""
         self._textures: dict[int, tuple[Any, Any]] = {}
         self._targets: dict[tuple[int, int, tuple[str, ...]], _Target] = {}
-        self._programs: dict[tuple[str, ...], Any] = {}
+        self._programs: dict[tuple[str, ...], _Program] = {}
         self._shadows: ShadowMap | None = None
+        self._cast: int | None = None
+        """Revision of the parts that cast shadows."""
         self._backdrop: Backdrop | None = None
 
     def render(self, camera: CameraSpec, T_world_camera: Pose) -> RenderedImages:
@@ -158,6 +176,7 @@ class GLRenderer(Renderer):
         for gone in self._bodies.values():
             _release(gone)
         self._bodies = present
+        self._drop_textures()
         self._drawables = [drawable for body in present.values() for drawable in body.drawables]
         parts = [drawable.part for drawable in self._drawables]
         places = [(part.body, part.link) for part in parts]
@@ -169,6 +188,15 @@ class GLRenderer(Renderer):
         for link, cell in zip(self._link_of[self._coarse], (p.mesh.cell for p in parts if p.coarse), strict=True):
             self._cells[link] = cell if np.isinf(self._cells[link]) else max(cell, self._cells[link])
         self._revision = self._scene.revision
+
+    def _drop_textures(self) -> None:
+        """Release what nothing shows any more, where there are many: each episode may bring others from files."""
+        used = {id(drawable.texture) for body in self._bodies.values() for drawable in body.drawables}
+        for key in list(self._textures) if len(self._textures) > _TEXTURES else ():
+            texture, _ = self._textures[key]
+            if id(texture) not in used:
+                texture.release()
+                del self._textures[key]
 
     def _upload(self, part: DrawnPart) -> _Drawable:
         mesh = part.mesh
@@ -182,7 +210,7 @@ class GLRenderer(Renderer):
         rows = np.concatenate([np.ascontiguousarray(c).view(np.uint8).reshape(len(c), -1) for c in columns], axis=1)
         vertices = self._context.buffer(rows.tobytes())
         indices = self._context.buffer(np.ascontiguousarray(mesh.faces, np.uint32).tobytes())
-        return _Drawable(part, vertices, indices, layout, texture, {}, [])
+        return _Drawable(part, vertices, indices, layout, texture, {})
 
     def _texture(self, image: NDArray[np.uint8], repeated: bool) -> Any:
         if id(image) not in self._textures:
@@ -201,31 +229,31 @@ class GLRenderer(Renderer):
         T_camera_world: Any = np.linalg.inv(T_world_camera.matrix())
         frames: Array = self._scene.link_frames(self._links)
         model_view = (T_camera_world @ frames)[self._link_of]
-        to_clip = _projection(camera)
+        to_clip, planes = _lens(camera.width, camera.height, camera.K)
         # Large distances are multiplied here in double precision, not in the shader.
         transforms = np.stack([to_clip @ model_view, model_view], axis=1)
         packed = np.ascontiguousarray(transforms.transpose(0, 1, 3, 2), np.float32).reshape(-1, 32)
 
         exposure = look.exposure.get(camera.name, 1.0)
         variant = self._light(look, streams, camera, frames, T_camera_world, exposure)
+        plain, textured = (self._program(streams, kind) for kind in (variant, (*variant, "textured")))
         target.clear(np.clip(exposure * np.array(look.background), 0.0, 1.0))
-        target.use()
-        for number in self._visible(camera, model_view):
+        for number in self._visible(camera.K[0][0], planes, model_view):
             drawable = self._drawables[number]
-            key = (*variant, "textured") if drawable.texture is not None else variant
-            program = self._program(streams, key)
-            matrices = packed[number]
-            program["model_view_projection"].write(matrices[:16])
-            if "model_view" in program:
-                program["model_view"].write(matrices[16:])
-            if "body" in program:
-                program["body"].value = float(self._bodies[drawable.part.body].number)
+            program = plain
             if drawable.texture is not None:
+                program = textured
                 drawable.texture.use(0)
+            matrices = packed[number]
+            program.to_clip.write(matrices[:16])
+            if program.model_view is not None:
+                program.model_view.write(matrices[16:])
+            if program.body is not None:
+                program.body.value = float(self._bodies[drawable.part.body].number)
             self._context.enable_only(
                 self._context.DEPTH_TEST | (self._context.CULL_FACE if drawable.part.mesh.closed else 0)
             )
-            self._array(drawable, (*streams, *key), program).render()
+            self._array(drawable, program).render()
         if look.backdrop:
             self._draw_backdrop(look, target, to_clip[:2, :3], T_world_camera, exposure)
         return target.read()
@@ -239,49 +267,44 @@ class GLRenderer(Renderer):
         T_camera_world: Array,
         gain: float,
     ) -> tuple[str, ...]:
-        """Draw the shadow map and set everything that does not differ between parts; return the kind of programs."""
+        """Draw the shadow map and write everything that does not differ between parts; return the kind of programs."""
         key, *fills = look.lights or (Light(color=(0.0, 0.0, 0.0)),)
-        lit = bool({"color", "infrared"} & set(streams))
-        values: dict[str, Any] = {
-            "key_light": T_camera_world[:3, :3] @ _unit(key.direction),
-            "key_color": key.color,
-            "up": T_camera_world[:3, 2],
-            "range": (camera.depth_min, camera.depth_max),
-            "ambience": look.ambient,
-            "exposure": gain,
-        }
+        to_camera = T_camera_world[:3, :3]
+        values = np.zeros((_LIGHT_ROWS, 4))  # the rows of the block Light
+        values[7] = *(to_camera @ _unit(key.direction)), look.ambient
+        values[8] = *key.color, gain
+        values[9, :3] = to_camera[:, 2]
+        values[11, :2] = camera.depth_min, camera.depth_max
         variant: tuple[str, ...] = ()
         if fills:
             variant = ("fill",)
             # Half from everywhere, half by the side that a surface has towards the light; and the ambient light, too.
             colors = 0.5 * _KEY * np.array([light.color for light in fills])
-            directions = np.array([T_camera_world[:3, :3] @ _unit(light.direction) for light in fills])
+            directions = np.array([to_camera @ _unit(light.direction) for light in fills])
             low, high = 0.5 * look.ambient * np.array(_AMBIENT)
-            by_side = colors.T @ directions + np.outer(high - low, T_camera_world[:3, 2])
-            values |= {"fill": colors.sum(axis=0) + low + high, "fill_by_side": by_side.T.ravel()}
-        if look.shadows and lit:
+            values[0:3, :3] = (colors.T @ directions + np.outer(high - low, to_camera[:, 2])).T
+            values[10, :3] = colors.sum(axis=0) + low + high
+        if look.shadows and {"color", "infrared"} & set(streams):
             variant += ("shadows",)
             to_light = self._draw_shadows(_unit(key.direction), frames) @ np.linalg.inv(T_camera_world)
             assert self._shadows is not None
             self._shadows.use(1)
-            values |= {"shadow_map": 1, "to_light": to_light[:3].T.ravel(), "offset": self._shadows.offset}
-        for kind in (variant, (*variant, "textured")):
-            program = self._program(streams, kind)
-            for name, value in values.items():
-                if name in program:
-                    program[name].value = value if np.isscalar(value) else tuple(map(float, value))
+            values[3:7, :3] = to_light[:3].T
+            values[9, 3] = self._shadows.offset
+        self._light_block.write(values.astype(np.float32))
+        self._light_block.bind_to_uniform_block(0)
         return variant
 
     def _draw_shadows(self, direction: Array, frames: Array) -> Array:
         """Return the matrix (4, 4) from the world to the shadow map, which shows the present state of the world."""
         if self._shadows is None:
             self._shadows = ShadowMap(self._context)
-        # Of a link that has coarse parts, these cast the shadow.
-        cast = self._coarse | np.isinf(self._cells)[self._link_of]
-        numbers = np.flatnonzero(cast)
-        key = (self._revision, direction.tobytes(), frames.tobytes())
-        casters = [self._drawables[number] for number in numbers]
-        return self._shadows.draw(key, direction, casters, frames[self._link_of[numbers]], self._balls[numbers])
+        if self._cast != self._revision:
+            # Of a link that has coarse parts, these cast the shadow.
+            cast = np.flatnonzero(self._coarse | np.isinf(self._cells)[self._link_of])
+            self._shadows.load([self._drawables[number].part for number in cast], self._link_of[cast])
+            self._cast = self._revision
+        return self._shadows.draw(direction, frames)
 
     def _draw_backdrop(self, look: Look, target: _Target, lens: Array, pose: Pose, gain: float) -> None:
         if self._backdrop is None:
@@ -292,23 +315,19 @@ class GLRenderer(Renderer):
         for name, layer in target.layers():
             self._backdrop.draw(layer, texture, rays, gain * np.array(look.background), name == "infrared")
 
-    def _visible(self, camera: CameraSpec, model_view: Array) -> Iterator[int]:
-        """Yield the drawables that the picture may show, nearest first, so that hidden pixels are not shaded."""
+    def _visible(self, focal: float, planes: Array, model_view: Array) -> list[int]:
+        """Return the drawables that the picture may show, nearest first, so that hidden pixels are not shaded."""
         centres = np.einsum("nij,nj->ni", model_view[:, :3], self._balls[:, :4])
         radii = self._balls[:, 4]
-        K = np.array(camera.K)
-        corners = np.array([[-0.5, -0.5, 1], [camera.width - 0.5, -0.5, 1], [-0.5, camera.height - 0.5, 1]])
-        corners = np.concatenate([corners, [[camera.width - 0.5, camera.height - 0.5, 1]]])
-        rays = corners @ np.linalg.inv(K).T  # upper left, upper right, lower left, lower right
-        planes = np.cross(rays[[0, 1, 3, 2]], rays[[1, 3, 2, 0]])  # point inwards
-        planes /= np.linalg.norm(planes, axis=1, keepdims=True)
         inside = (centres @ planes.T >= -radii[:, None]).all(axis=1) & (centres[:, 2] + radii > _NEAR)
         # The nearest point of each link selects its coarse parts or the others.
         nearest = np.full(len(self._links), np.inf)
         np.minimum.at(nearest, self._link_of, centres[:, 2] - radii)
-        coarse = self._cells * K[0, 0] <= _COARSE_PIXELS * nearest
+        coarse = self._cells * focal <= _COARSE_PIXELS * nearest
         numbers = np.flatnonzero(inside & (self._coarse == coarse[self._link_of]))
-        return iter(numbers[np.argsort(centres[numbers, 2] - radii[numbers])].tolist())
+        # By their farthest points: a floor is behind what stands on it, although it begins before it.
+        order: list[int] = numbers[np.argsort(centres[numbers, 2] + radii[numbers])].tolist()
+        return order
 
     def _target(self, width: int, height: int, streams: tuple[str, ...]) -> _Target:
         key = (width, height, streams)
@@ -316,7 +335,7 @@ class GLRenderer(Renderer):
             self._targets[key] = _Target(self._context, width, height, streams)
         return self._targets[key]
 
-    def _program(self, streams: tuple[str, ...], kind: tuple[str, ...]) -> Any:
+    def _program(self, streams: tuple[str, ...], kind: tuple[str, ...]) -> _Program:
         key = (*streams, *kind)
         if key not in self._programs:
             defines = "".join(f"#define {name.upper()}\n" for name in key)
@@ -324,19 +343,25 @@ class GLRenderer(Renderer):
                 f"layout(location = {place}) out {_OUTPUTS[name].type} out_{name};\n"
                 for place, name in enumerate(streams)
             )
-            self._programs[key] = self._context.program(
-                vertex_shader=f"#version 330\n{defines}{_VERTEX}",
-                fragment_shader=f"#version 330\n{defines}{outputs}{_FRAGMENT}",
+            program = self._context.program(
+                vertex_shader=f"#version 330\n{defines}{_LIGHT}{_VERTEX}",
+                fragment_shader=f"#version 330\n{defines}{outputs}{_LIGHT}{_FRAGMENT}",
             )
+            if "Light" in program:
+                program["Light"].binding = 0
+            if "shadow_map" in program:
+                program["shadow_map"].value = 1
+            uniforms = (program.get(name, None) for name in ("model_view_projection", "model_view", "body"))
+            self._programs[key] = _Program(key, program, *uniforms)
         return self._programs[key]
 
-    def _array(self, drawable: _Drawable, key: tuple[str, ...], program: Any) -> Any:
-        if key not in drawable.arrays:
+    def _array(self, drawable: _Drawable, program: _Program) -> Any:
+        if program.key not in drawable.arrays:
             content = [(drawable.vertices, *drawable.layout)]
-            drawable.arrays[key] = self._context.vertex_array(
-                program, content, index_buffer=drawable.indices, skip_errors=True
+            drawable.arrays[program.key] = self._context.vertex_array(
+                program.program, content, index_buffer=drawable.indices, skip_errors=True
             )
-        return drawable.arrays[key]
+        return drawable.arrays[program.key]
 
 
 def _unit(direction: Any) -> Array:
@@ -349,8 +374,8 @@ def _release(body: _Body | None) -> None:
     for drawable in body.drawables if body else ():
         for array in drawable.arrays.values():
             array.release()
-        for buffer in (drawable.vertices, drawable.indices, *drawable.buffers):
-            buffer.release()
+        drawable.vertices.release()
+        drawable.indices.release()
 
 
 # --- where OpenGL draws to --------------------------------------------------------------------------------------------
@@ -364,12 +389,25 @@ def create_context() -> Any:
         raise DriverMissing(f"{error}; pip install moderngl") from error
     options: dict[str, Any] = {"standalone": True, "backend": "egl"}
     try:
+        _keep_freed_memory()
         with _limit_threads():
             context: Any = moderngl.create_context(require=330, **options)
     except Exception as error:  # glcontext raises bare Exceptions
         raise DriverMissing(f"{error}; {_REMEDY}") from error
     context.front_face = "cw"  # the picture is drawn upside down, which turns every triangle over
     return context
+
+
+def _keep_freed_memory() -> None:
+    """Let the C library keep up to 64 MiB of freed memory, which each picture needs again.
+
+    By default, glibc returns more than a few of a picture's buffers to the system, which must clear all of their pages
+    for the next picture: a fifth of the processor time.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(_M_TRIM_THRESHOLD, 64 << 20)
+        mallopt(_M_MMAP_THRESHOLD, 32 << 20)
 
 
 @contextmanager
@@ -393,10 +431,12 @@ class _Target:
         self._shape = (height, width)
         depth = context.depth_renderbuffer((width, height))
         layers = [context.texture((width, height), _OUTPUTS[s].components, dtype=_OUTPUTS[s].dtype) for s in streams]
-        # A framebuffer for each layer too: a clear fills all layers of a framebuffer with one colour.
-        self._depth = context.framebuffer([], depth)
         self._all = context.framebuffer(layers, depth)
-        self._each = [context.framebuffer([layer]) for layer in layers]
+        self._open: Any = self._all.color_mask
+        one, none = (True,) * 4, (False,) * 4
+        self._masks = dict.fromkeys(streams, one)
+        if len(streams) > 1:
+            self._masks = {name: [one if other == name else none for other in streams] for name in streams}
         self._lit = {
             name: context.framebuffer([layer], depth)
             for name, layer in zip(streams, layers, strict=True)
@@ -404,20 +444,18 @@ class _Target:
         }
 
     def clear(self, background: Array) -> None:
-        """Clear all layers; ``background`` (3,) is the colour of the background, 0..1."""
+        """Clear all layers, and draw into them from now on; ``background`` (3,) is that of light, 0..1."""
         grey = float(background @ np.array(LUMINANCE))
         colors = {"color": (*background.tolist(), 1.0), "infrared": (grey,) * 4}
-        for name, layer in zip(self._streams, self._each, strict=True):
-            layer.clear(*colors.get(name, _OUTPUTS[name].background))
-        self._depth.clear(depth=1.0)
+        self._all.use()
+        for name, mask in self._masks.items():  # a clear fills all layers of a framebuffer with one colour
+            self._all.color_mask = mask
+            self._all.clear(*colors.get(name, _OUTPUTS[name].background), depth=1.0)
+        self._all.color_mask = self._open
 
     def layers(self) -> Iterator[tuple[str, Any]]:
         """Yield the framebuffer of each layer that shows light, with the depths of what was drawn."""
         yield from self._lit.items()
-
-    def use(self) -> None:
-        """Draw into all layers."""
-        self._all.use()
 
     def read(self) -> RenderedImages:
         found: dict[str, NDArray[Any]] = {}
@@ -441,19 +479,25 @@ class _Target:
         )
 
 
-def _projection(camera: CameraSpec) -> NDArray[np.float64]:
-    """Return the projection (4, 4) from the camera's frame to clip space, with the rows of the picture upwards.
+@lru_cache(maxsize=64)
+def _lens(width: int, height: int, K: tuple[tuple[float, ...], ...]) -> tuple[Array, Array]:
+    """Return a pinhole camera's projection (4, 4) and the sides of what it sees.
 
-    The centre of pixel (u, v) lies at ((u + 0.5) 2 / W - 1, (v + 0.5) 2 / H - 1).
+    The projection is from the camera's frame to clip space, with the rows of the picture upwards: the centre of pixel
+    (u, v) lies at ((u + 0.5) 2 / W - 1, (v + 0.5) 2 / H - 1). The sides (4, 3) are planes through the camera, as unit
+    vectors that point inwards.
     """
-    width, height = camera.width, camera.height
-    K = np.array(camera.K)
+    rows = np.array(K)
     matrix = np.zeros((4, 4))
-    matrix[0, :3] = (K[0] + [0, 0, 0.5]) * 2 / width - [0, 0, 1]
-    matrix[1, :3] = (K[1] + [0, 0, 0.5]) * 2 / height - [0, 0, 1]
+    matrix[0, :3] = (rows[0] + [0, 0, 0.5]) * 2 / width - [0, 0, 1]
+    matrix[1, :3] = (rows[1] + [0, 0, 0.5]) * 2 / height - [0, 0, 1]
     matrix[2, 2:] = (_FAR + _NEAR) / (_FAR - _NEAR), -2 * _FAR * _NEAR / (_FAR - _NEAR)
     matrix[3, 2] = 1
-    return matrix
+    right, lower = width - 0.5, height - 0.5
+    corners = np.array([[-0.5, -0.5, 1], [right, -0.5, 1], [right, lower, 1], [-0.5, lower, 1]])
+    rays = corners @ np.linalg.inv(rows).T
+    planes = np.cross(rays, np.roll(rays, -1, axis=0))
+    return matrix, planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
 
 # --- shaders: one source, of which each set of streams compiles what it needs -----------------------------------------
@@ -483,6 +527,24 @@ _KEY = 0.36
 _AMBIENT = (0.34, 0.32, 0.31), (0.52, 0.54, 0.57)
 """Light from everywhere on what faces downwards, and upwards."""
 
+_LIGHT = """
+layout(std140) uniform Light {
+    mat3 fill_by_side;
+    mat4x3 to_light;
+    vec3 key_light;
+    float ambience;
+    vec3 key_color;
+    float exposure;
+    vec3 up;
+    float offset;
+    vec3 fill;
+    vec2 range;
+};
+"""
+"""What does not differ between parts."""
+_LIGHT_ROWS = 12
+"""Length of that block, in rows of four floats."""
+
 _VERTEX = """
 #if defined(COLOR) || defined(INFRARED)
 #define LIT
@@ -501,8 +563,6 @@ in vec2 uv;
 out vec2 place;
 #endif
 #ifdef SHADOWS
-uniform mat4x3 to_light;
-uniform float offset;
 out vec3 in_light;
 #endif
 #endif
@@ -533,15 +593,6 @@ _FRAGMENT = (
 #define LIT
 #endif
 #ifdef LIT
-uniform vec3 key_light;
-uniform vec3 key_color;
-uniform vec3 up;
-uniform float ambience;
-uniform float exposure;
-#ifdef FILL
-uniform vec3 fill;
-uniform mat3 fill_by_side;
-#endif
 #ifdef SHADOWS
 uniform sampler2DShadow shadow_map;
 in vec3 in_light;
@@ -553,9 +604,6 @@ in vec3 paint;
 uniform sampler2D picture;
 in vec2 place;
 #endif
-#endif
-#ifdef DEPTH
-uniform vec2 range;
 #endif
 #ifdef SEGMENTATION
 uniform float body;

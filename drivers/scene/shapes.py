@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -25,6 +26,8 @@ _SEGMENTS, _COARSE_SEGMENTS = 48, 16
 0.2 % of its radius, or by 1.9 %."""
 _TEXTURE = 0.25
 """Side of a texture that covers a body, m."""
+_CELLS = 6
+"""Size of the details of a part that its shadow has, as a share of the part's radius: one of so many."""
 _PLANE_HALF = 50.0
 """Half the side of the square that is drawn for an infinite plane, m."""
 
@@ -296,6 +299,23 @@ class DrawnPart:
     """(3,) centre of a ball around the mesh, m."""
     radius: float
     """Radius of that ball, m."""
+
+    @cached_property
+    def outline(self) -> tuple[Points, NDArray[np.int64]]:
+        """Points (P, 3), m, and triangles (F, 3) for its shadow, turned outwards: all points within a cell are one."""
+        mesh = self.mesh
+        cells = np.floor(mesh.positions / (self.radius / _CELLS)).astype(np.int64)
+        _, place = np.unique(cells, axis=0, return_inverse=True)
+        place = place.reshape(-1)
+        counts = np.bincount(place)
+        points = np.stack([np.bincount(place, mesh.positions[:, k]) / counts for k in range(3)], axis=1)
+        faces = place[mesh.faces]
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        if not len(faces):  # a rod, or what is so flat that it has no cell of its own
+            points, faces = mesh.positions, mesh.faces.astype(np.int64)
+        first = faces.argmin(axis=1)[:, None]
+        faces = np.unique(np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0)
+        return points.astype(np.float32), faces if mesh.closed else np.concatenate([faces, faces[:, ::-1]])
 
 
 def parts_of(body: int, visuals: Sequence[Visual], load_mesh: Callable[[str], Sequence[Mesh]]) -> list[DrawnPart]:

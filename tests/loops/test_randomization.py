@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from engines_kit import need_engine
 
 import hal
 from hal.apps import generate, replay
@@ -306,3 +307,14 @@ def test_a_thin_rod_casts_a_shadow(tmp_path: Path) -> None:
     eye |= {"field_of_view": {"vertical_deg": 50}, "streams": ["color"]}
     with opened({"cameras": {"eye": eye}, "objects": ["floor", *things]}, ENGINES[0]) as rig:
         assert rig.cameras["eye"].read().color is not None
+
+
+def test_a_renderer_that_cannot_vary_the_light_says_so() -> None:
+    need_engine("pybullet")
+    eye = {"model": "pinhole", "capture": {"width": 16, "height": 16, "rate_hz": 30}, "pose": {"position": [0, 0, 2]}}
+    eye |= {"field_of_view": {"vertical_deg": 50}, "streams": ["color"]}
+    varies = {"light": {"ambient": [0.5, 1.0]}, "cameras": {"eye": {"exposure": [0.5, 1.5]}}}
+    for name, told in (("tiny", True), ("gl", False)):
+        simulation = {"renderer": name, "randomize": varies}
+        with opened({"cameras": {"eye": eye}, "objects": ["floor"], "simulation": simulation}, "pybullet") as rig:
+            assert any("light, exposure: without effect" in note for note in rig.notes) == told, rig.notes
