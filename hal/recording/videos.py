@@ -300,9 +300,10 @@ class _OpenVideo:
         import av
 
         self._container = av.open(str(path))
-        self._stream: Any = self._container.streams.video[0]
-        self._stream.thread_count = 1  # more threads would delay the first picture
-        self._ticks = float(1 / self._stream.time_base)
+        stream: Any = self._container.streams.video[0]
+        stream.thread_count = 1  # more threads would delay the first picture
+        self._stream = stream
+        self._ticks = float(1 / stream.time_base)
         """Steps of the video's time in a second."""
         self._as_rgb24 = _RgbConverter()
 
