@@ -1,4 +1,4 @@
-"""Real time: missed servo ticks, frame rates, ages of states and frames, alone and on a loaded computer."""
+"""Real time: missed ticks, frame rates, ages of states and frames, also on a loaded computer; from a pad to the arm."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -14,10 +15,11 @@ from typing import Any
 import numpy as np
 
 import hal
+from hal.errors import MotionStopped
 from hal.histogram import Histogram
 from hal.host.main import PeriodicPace
 
-from .kit import ENGINES, ROOT, Table, ticks_missed
+from .kit import ENGINES, ROOT, Table, ms, ticks_missed
 
 PATHS = ("hal/host", "hal/servo", "drivers/scene", "drivers/pybullet", "drivers/mujoco")
 RATES = (240.0, 1000.0)
@@ -88,6 +90,39 @@ def drive_without_right(*arguments: Any) -> dict[str, Any]:
     return found
 
 
+def follow_stick(rate_hz: float, presses: int, woken: bool) -> list[float]:
+    """Return times from the motion of a stick to the first set-point that moves, s, of a loop of 50 Hz."""
+    overrides = ["cameras={}", f"simulation.physics_hz={rate_hz:g}", "gamepads.pad={model: auto, driver: mock}"]
+    with hal.open("panda_table", sim=True, clock="real_time", overrides=overrides) as rig:
+        arm, pad, found, changed = rig.robots["panda"], rig.gamepads["pad"], [], threading.Event()
+        pad.wake(changed)
+        teleop, mover = hal.Teleop(arm), threading.Thread(target=_move_stick, args=(rig, presses, found))
+        with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
+            mover.start()
+            for tick in rig.clock.rate(50, changed if woken else None):
+                with contextlib.suppress(MotionStopped):
+                    control.send(teleop.step(pad.state(), tick.dt)[0])
+                if not mover.is_alive():
+                    break
+    return found
+
+
+def _move_stick(rig: hal.Rig, presses: int, found: list[float]) -> None:
+    arm, pad, dice = rig.robots["panda"], rig.driver("pad"), np.random.default_rng(1)
+    while len(found) < presses:
+        if arm.state(max_age=5.0).status is not hal.RobotStatus.FOLLOWING:
+            pad.release("l2")
+            time.sleep(0.1)
+            pad.press("l2")
+        time.sleep(0.2 + 0.02 * dice.random())  # at rest, and not in step with the loop
+        begun = time.monotonic()
+        pad.stick("left_x", 1.0)
+        time.sleep(0.1)
+        moved = [state.stamp.t for state in arm.states(begun) if abs(state.dq_set).max() > 1e-6]
+        pad.stick("left_x", 0.0)
+        found += [moved[0] - begun] if moved else []
+
+
 def run(quick: bool) -> Iterator[Table]:
     """Yield the tables."""
     seconds, engines, rates = (0.5, ENGINES[:1], RATES[:1]) if quick else (10.0, ENGINES, RATES)
@@ -113,4 +148,11 @@ def run(quick: bool) -> Iterator[Table]:
                     rows.append(measure(ENGINES[0], rate, seconds, True, priority != PRIORITIES[2]))
             cells = (f"{row['missed, %']}; {row['period, ms, p99 and max']}" for row in rows)
             table.add(f"{rate:g} Hz", number, *cells)
+    yield table
+    presses = 1 if quick else 60
+    table = Table(
+        f"a stick to the first set-point that moves, ms, {presses} times", ("servo", "50 Hz (reference)", "woken")
+    )
+    for rate in rates:
+        table.add(f"{rate:g} Hz", *(ms(follow_stick(rate, presses, woken), 0.5, 0.9) for woken in (False, True)))
     yield table

@@ -8,8 +8,8 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,9 +245,9 @@ def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) ->
             _write_hull(hull, Path(place) / f"{k}.obj")
             parts.append(f'<collision><geometry><mesh filename="{k}.obj"/></geometry></collision>')
         if drawn and spec.visible:
-            size, name, rgba = " ".join([str(spec.scale)] * 3), quoteattr(str(spec.mesh)), " ".join(map(str, spec.rgba))
+            size, name, rgba = " ".join([str(spec.scale)] * 3), escape(str(spec.mesh)), " ".join(map(str, spec.rgba))
             look = f'<material name="it"><color rgba="{rgba}"/></material>'
-            parts.append(f"<visual><geometry><mesh filename={name} scale='{size}'/></geometry>{look}</visual>")
+            parts.append(f"<visual><geometry><mesh filename='{name}' scale='{size}'/></geometry>{look}</visual>")
         if free:
             solid = uniform_solid(hulls)
             roll, pitch, yaw = _rpy(solid.axes)

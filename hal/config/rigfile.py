@@ -15,12 +15,18 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import itertools
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core.core_schema import ModelSchema
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..registry import explain_engine
@@ -461,6 +467,28 @@ class RigFile(Strict):
     simulation: Annotated[SimulationConfig, BeforeValidator(_fill_section)] = SimulationConfig()
 
 
+class _DescribedSchema(GenerateJsonSchema):
+    """Describes each key by the docstring of its field; pydantic would read them whenever a rig is opened."""
+
+    def model_schema(self, schema: ModelSchema) -> dict[str, Any]:
+        found = super().model_schema(schema)
+        for name, text in _field_docstrings(schema["cls"]):
+            found["properties"][name]["description"] = text
+        return found
+
+
+def _field_docstrings(record: type) -> Iterator[tuple[str, str]]:
+    """Yield the name and the docstring of each documented field of a record."""
+    for kind in reversed(record.__mro__[: record.__mro__.index(Strict)]):
+        (definition,) = ast.parse(inspect.getsource(kind)).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, text in itertools.pairwise(definition.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                yield ast.unparse(field.target), inspect.cleandoc(str(text.value.value))
+
+
 def rig_schema() -> dict[str, Any]:
     """Return the JSON schema of a rig's file: an editor uses it for completion and checks."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | RigFile.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | RigFile.model_json_schema(
+        schema_generator=_DescribedSchema
+    )

@@ -39,7 +39,7 @@ class ValueProblem(ValueError):
 class Strict(BaseModel):
     """A record without unknown keys. One from a file with mistakes can have holes, which raise :class:`Unknown`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     if not TYPE_CHECKING:  # so that mypy still finds misspelt attributes
 

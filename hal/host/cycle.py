@@ -367,8 +367,6 @@ def _find_allowed(memories: Sequence[GroupMemory], name: str, now: float) -> int
     return 0
 
 
-STOP_LIMIT = 5.0
-"""Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 LOWER_LIMIT = 7.0
 """Longest time for lowering arms without brakes before they are closed anyway, s."""
 

@@ -17,8 +17,7 @@ from .. import registry
 from ..commands import StopLatch
 from ..errors import ConnectionLost, HalError
 from ..specs import GripperSpec, GroupSpec, RobotSpec, to_json
-from .cycle import STOP_LIMIT, Cycle
-from .process import Child, SharedMemory
+from .process import STOP_LIMIT, Child, SharedMemory
 from .records import AppRecord, GroupMemory
 
 if TYPE_CHECKING:
@@ -153,6 +152,8 @@ class LocalHost(Host):
             latch: The rig's latched stop.
             shared: Memory that those may read; None if there are none.
         """
+        from .cycle import Cycle  # with the servo's libraries, so only in the process that runs it
+
         super().__init__(latch)
         self.spec = spec
         self._shared = shared

@@ -18,9 +18,9 @@ from typing import Any
 from ..errors import ConnectionLost
 from ..histogram import Histogram
 from ..specs import GroupSpec, from_json
-from .cycle import STOP_LIMIT, Cycle
+from .cycle import Cycle
 from .memory import SeriesBox
-from .process import Channel, SharedMemory, end_by_signal, pack_error
+from .process import STOP_LIMIT, Channel, SharedMemory, end_by_signal, pack_error
 from .records import AppRecord, GroupMemory
 from .scheduling import describe, is_realtime, prepare_process
 

@@ -42,6 +42,8 @@ START_TIMEOUT = 60.0
 """Longest time that a child may take to get ready, s: reading a large mesh for the first time takes a while."""
 REQUEST_TIMEOUT = 30.0
 """Longest time that an answer may take, s, unless a request names another."""
+STOP_LIMIT = 5.0
+"""Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 _GOODBYE = 0.5
 """A child that does not take the message that ends it within so long, s, is stopped or hangs."""
 _SLICE = 0.2

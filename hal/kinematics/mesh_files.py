@@ -12,6 +12,7 @@ import importlib.util
 import os
 import re
 import struct
+import sys
 import xml.etree.ElementTree as ElementTree
 from functools import lru_cache
 from pathlib import Path
@@ -30,22 +31,24 @@ def package_folder(package: str) -> Path | None:
     Wheels of cmeel, such as ``example_robot_data``, hold no module, only files: the folder is then that of their data.
     """
     try:
-        spec = importlib.util.find_spec(package)
+        return _find_package(package, tuple(sys.path))
     except (ImportError, ValueError):
         return None
-    if spec is None:
-        return _cmeel_folder(package.replace("_", "-"))
-    if spec.submodule_search_locations:
+
+
+@lru_cache(maxsize=64)  # each mesh of an arm asks for it; a package that is not found may be installed later
+def _find_package(package: str, path: tuple[str, ...]) -> Path:
+    """Return the folder of a package; ``path`` is where Python looks for it. Raises ImportError if there is none."""
+    spec = importlib.util.find_spec(package)
+    if spec is not None and spec.submodule_search_locations:
         return Path(next(iter(spec.submodule_search_locations)))
-    return Path(spec.origin).parent if spec.origin else None
-
-
-def _cmeel_folder(name: str) -> Path | None:
-    try:
-        folder = Path(str(importlib.metadata.distribution(name).locate_file(f"cmeel.prefix/share/{name}")))
-    except (importlib.metadata.PackageNotFoundError, ValueError):
-        return None
-    return folder if folder.is_dir() else None
+    if spec is not None and spec.origin:
+        return Path(spec.origin).parent
+    name = package.replace("_", "-")
+    folder = Path(str(importlib.metadata.distribution(name).locate_file(f"cmeel.prefix/share/{name}")))
+    if not folder.is_dir():
+        raise ImportError(f"{package} has no folder")
+    return folder
 
 
 def mesh_file(name: str, folder: Path) -> Path:

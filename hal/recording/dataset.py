@@ -151,12 +151,17 @@ class Episode:
         """
         if self._about is not None:
             return self._about
-        self._version = file_version(self._layout.about(self.number))
+        self._version = file_version(self._about_file)
         return read_about(self._layout, self.number)
+
+    @cached_property
+    def _about_file(self) -> Path:
+        """The file of the metadata."""
+        return self._layout.about(self.number)
 
     def _is_current(self) -> bool:
         """Return whether the known place is that of the episode's files now."""
-        return self._about is not None or self._version == file_version(self._layout.about(self.number))
+        return self._about is not None or self._version == file_version(self._about_file)
 
     def _follow(self) -> None:
         """Read the metadata again if the episode was marked, or its files joined with others, since it was read.
@@ -166,16 +171,17 @@ class Episode:
         known = self.info
         if self._is_current():
             return
-        version, found = file_version(self._layout.about(self.number)), read_about(self._layout, self.number)
+        version, found = file_version(self._about_file), read_about(self._layout, self.number)
         if known | _MAY_CHANGE != found | _MAY_CHANGE:
             raise self._changed()
         self._version, self.info = version, found
         self.__dict__.pop("place", None)
+        self.__dict__.pop("_files", None)
 
     def _changed(self) -> DatasetError:
         return DatasetError(
             "another episode has this number since the dataset was opened: open it again",
-            file=self._name(self._layout.about(self.number)),
+            file=self._name(self._about_file),
             episode=self.number,
             code="dataset_changed",
         )
@@ -335,7 +341,7 @@ class Episode:
         path = self._file_of(camera, "color")
         own = range(self.length)[row]
         with dataset_errors(self._layout.root, path, self.number):
-            found = read_picture(path, self.first_picture(path) + own, self.fps)
+            found = read_picture(path, self.place.video(camera)[1] + own, self.fps)
         self._check_current()
         if found is None:
             raise self._wrong(path, f"has no picture of row {own}")
@@ -344,7 +350,7 @@ class Episode:
     def _file_of(self, camera: str, stream: str) -> Path:
         """Return the file of a stream. Raises DeviceNotFound if it was not recorded."""
         self._follow()
-        files = self.files(camera)
+        files = self._files.get(camera, {})
         if stream not in files:
             there = ", ".join(self.cameras) or "none"
             kept = ", ".join(files) or "nothing"
@@ -359,9 +365,14 @@ class Episode:
 
     def files(self, camera: str) -> dict[str, Path]:
         """Return the file of each stream of a camera; empty for a camera that was not recorded."""
-        known, features = self.info["cameras"].get(camera), self._meta["features"]
-        if known is None:
-            return {}
+        return dict(self._files.get(camera, {}))
+
+    @cached_property
+    def _files(self) -> dict[str, dict[str, Path]]:
+        return {camera: self._list_files(camera, known) for camera, known in self.info["cameras"].items()}
+
+    def _list_files(self, camera: str, known: Mapping[str, Any]) -> dict[str, Path]:
+        features = self._meta["features"]
         videos = {"color": camera} | {stream: f"{camera}_{stream}" for stream in MORE_STREAMS}
         found = {
             stream: self._layout.video(name, self.place.video(name)[0])

@@ -24,6 +24,7 @@ from .layout import file_version
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.video.frame import VideoFrame
 
 Picture = NDArray[np.uint8]
 
@@ -231,7 +232,7 @@ def picture_stats(path: Path, length: int, fps: int, first: int = 0) -> PictureS
     """
     import av
 
-    stats = PictureStats()
+    stats, as_rgb24 = PictureStats(), _RgbConverter()
     every = max(1, min(fps, length // _SAMPLES))
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
@@ -241,9 +242,9 @@ def picture_stats(path: Path, length: int, fps: int, first: int = 0) -> PictureS
             if packet.is_keyframe and count >= due:
                 due = count + every
                 for frame in stream.codec_context.decode(packet):
-                    stats.add(frame.to_ndarray(format="rgb24"))
+                    stats.add(as_rgb24(frame))
         for frame in stream.codec_context.decode(None):
-            stats.add(frame.to_ndarray(format="rgb24"))
+            stats.add(as_rgb24(frame))
     return stats
 
 
@@ -251,13 +252,28 @@ def read_video(path: Path, first: int = 0, fps: int = 1) -> Iterator[Picture]:
     """Yield every picture (H, W, 3) RGB from number ``first`` on, in order; ``fps`` is needed only for ``first``."""
     import av
 
+    as_rgb24 = _RgbConverter()
     with av.open(str(path)) as container:
         stream: Any = container.streams.video[0]
         stream.thread_type = "AUTO"
         _seek(container, first, fps)
         for frame in container.decode(stream):
             if not first or round(frame.pts * frame.time_base * fps) >= first:
-                yield frame.to_ndarray(format="rgb24")
+                yield as_rgb24(frame)
+
+
+class _RgbConverter:
+    """Converts decoded pictures to RGB, in one thread: PyAV 17 uses all, and waking them takes longer than the work."""
+
+    def __init__(self) -> None:
+        import av
+
+        self._reformatter = av.video.reformatter.VideoReformatter()
+        self._threads = {"threads": 1} if int(av.__version__.split(".")[0]) >= 17 else {}
+
+    def __call__(self, frame: VideoFrame) -> Picture:
+        converted: Any = self._reformatter.reformat(frame, format="rgb24", **self._threads)
+        return np.asarray(converted.to_ndarray(), np.uint8)
 
 
 class _OpenVideo:
@@ -267,18 +283,20 @@ class _OpenVideo:
         import av
 
         self._container = av.open(str(path))
-        self._stream: Any = self._container.streams.video[0]
-        self._stream.thread_count = 1  # more threads would delay the first picture
-        self._reformatter = av.video.reformatter.VideoReformatter()
+        stream: Any = self._container.streams.video[0]
+        stream.thread_count = 1  # more threads would delay the first picture
+        self._stream = stream
+        self._ticks = float(1 / stream.time_base)
+        """Steps of the video's time in a second."""
+        self._as_rgb24 = _RgbConverter()
 
     def picture(self, number: int, fps: int) -> Picture | None:
-        time_base = self._stream.time_base
-        self._container.seek(round(number / (fps * time_base)), stream=self._stream)
-        wanted = round((number - 0.5) / (fps * time_base))
+        period = self._ticks / fps
+        self._container.seek(round(number * period), stream=self._stream)
+        wanted = round((number - 0.5) * period)
         for frame in self._container.decode(self._stream):
             if frame.pts >= wanted:
-                found: Any = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
-                return np.asarray(found, np.uint8)
+                return self._as_rgb24(frame)
         return None
 
 

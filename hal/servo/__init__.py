@@ -5,8 +5,3 @@ commands into motions; ``envelope`` caps them to the session's terms; ``smoothin
 every limit; ``anchoring`` checks whether the device took the last one; ``controllers`` and ``compliance`` make torques
 of it where a session has a controller; ``audit`` recomputes from what the driver was given whether limits were kept.
 """
-
-from .report import ServoReport
-from .servo import Servo
-
-__all__ = ["Servo", "ServoReport"]
