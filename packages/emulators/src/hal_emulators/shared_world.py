@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import subprocess
 import sys
@@ -21,6 +22,8 @@ _START = 60.0
 """Longest time that the program of the world takes to get ready, s: the first time it reads large meshes."""
 _END = 5.0
 """Longest time that it takes to end, s."""
+_LEAD = 0.03
+"""Time, s, by which an arm's fingers may be ahead of the world, whose messages take about 0.01 s."""
 _AT_REST = 4e-6
 """Motion of a joint between two reports, rad, below which the arm counts as being at rest."""
 
@@ -46,10 +49,25 @@ class ArmInWorld:
         connection.sock.setblocking(False)
         self._connection: Connection | None = connection
         self.object_width: float | None = answer["object"]
+        self._reached: float = answer["t"]
+        """Time that the world has reached, s; infinite once it is lost."""
         self._t = time.monotonic()
         """Time of the arm, s: it falls behind where the emulator is late, so that no motion in the world is faster."""
         self._due = self._t
         self._q: list[float] = []
+
+    @property
+    def now(self) -> float:
+        """Time of the arm, s; what comes from its client is for this time."""
+        return self._t
+
+    @property
+    def now_of_fingers(self) -> float:
+        """Time of the fingers, s: that of the arm, but hardly ahead of the world, which is late on a busy computer.
+
+        Fingers that close before the world's arm has come to the object would miss it.
+        """
+        return min(self._t, self._reached + _LEAD)
 
     def exchange(self, dt: float, q: Sequence[float]) -> None:
         """Report the joint positions (n,), rad, after a cycle of ``dt`` s, and take what the world says."""
@@ -70,13 +88,13 @@ class ArmInWorld:
             print(f"warning: {error}; until then the fingers meet no objects", file=sys.stderr, flush=True)
             return
         if answer is not None:
-            self.object_width = answer["object"]
+            self.object_width, self._reached = answer["object"], answer["t"]
 
     def close(self) -> None:
         """Leave the world."""
         if self._connection is not None:
             self._connection.close()
-        self._connection, self.object_width = None, None
+        self._connection, self.object_width, self._reached = None, None, math.inf
 
 
 def has_world(config: str, overrides: Sequence[str] = ()) -> bool:

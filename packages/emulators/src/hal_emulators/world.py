@@ -131,19 +131,16 @@ class ArmOfWorld:
             self._target = wanted
             fingers.move(wanted[0], spec.speed, wanted[1])
 
-    def finish_step(self, t: float) -> bool:
-        """Find out what the fingers touch; return whether the emulator has to know."""
+    def finish_step(self, t: float) -> None:
+        """Find out what the fingers touch."""
         if self._fingers is None:
-            return False
+            return
         width = self._fingers.read(t).width
-        before = self.object_width
         if self._is_between():
             self._touched_at = t
             self.object_width = width
         elif t > self._touched_at + _TOUCHED:
             self.object_width = None
-        now = self.object_width
-        return now != before if now is None or before is None else abs(now - before) > 1e-6
 
     def _is_between(self) -> bool:
         """Return whether both fingers touch one thing, from opposite sides."""
@@ -181,6 +178,8 @@ class WorldServer:
         self._clients: dict[int, Connection] = {}
         self._roles: dict[int, str] = {}
         self._arms_of: dict[int, ArmOfWorld] = {}
+        self._requests: deque[tuple[float, int, int, str, dict[str, Any]]] = deque()
+        """Time of the world for which a request is, s, the client that waits for the answer, and the request."""
         self._t = time.monotonic()
         """Time of the step that was made last, s."""
         self._build()
@@ -209,6 +208,7 @@ class WorldServer:
             if self._t + dt <= reported:
                 self._t += dt
                 self._step(self._t, dt)
+            self._answer_due(self._t + dt)
             ready = self._t + dt <= reported
             for descriptor, _ in self._poller.poll(0.0 if ready else dt):
                 if descriptor == until:
@@ -233,10 +233,10 @@ class WorldServer:
         for arm in self.arms.values():
             arm.prepare_step(t, dt)
         self.world.step()
-        changed = {name for name, arm in self.arms.items() if arm.finish_step(t)}
+        for arm in self.arms.values():
+            arm.finish_step(t)
         for descriptor, arm in self._arms_of.items():
-            if arm.name in changed:
-                self._send(descriptor, {"object": arm.object_width})
+            self._send(descriptor, {"object": arm.object_width, "t": t})
         watching = [descriptor for descriptor, role in self._roles.items() if role == "poses"]
         if watching:
             state = self._state()
@@ -266,7 +266,8 @@ class WorldServer:
                 elif descriptor in self._arms_of:
                     self._arms_of[descriptor].take(message)
                 else:
-                    client.send(self._answer(message))
+                    request = message["id"], message["method"], message["params"]
+                    self._requests.append((self._reported(time.monotonic()), descriptor, *request))
         except ConnectionLost:
             self._drop(descriptor)
         except Exception:  # of what this client sent: the world goes on without it
@@ -276,17 +277,24 @@ class WorldServer:
     def _drop(self, descriptor: int) -> None:
         client = self._clients.pop(descriptor)
         self._poller.unregister(client.sock)
-        self._roles.pop(descriptor, None)
+        if self._roles.pop(descriptor, None) == "requests":
+            self._requests.clear()
         self._arms_of.pop(descriptor, None)
         client.close()
 
-    def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
+    def _answer_due(self, t: float) -> None:
+        """Answer the requests that came before ``t``: a late world has caught up with what their clients knew."""
+        while self._requests and self._requests[0][0] <= t:
+            _, descriptor, number, method, params = self._requests.popleft()
+            self._send(descriptor, self._answer(number, method, params))
+
+    def _answer(self, number: int, method: str, params: dict[str, Any]) -> dict[str, Any]:
         """Return the answer to a request of :class:`.shared.SharedWorld`, with the state after it."""
         try:
-            result = self.world.request(message["method"], message["params"])
+            result = self.world.request(method, params)
         except Exception as error:
-            return {"id": message["id"], "error": pack_error(error)}
-        return {"id": message["id"], "result": result, "state": self._state()}
+            return {"id": number, "error": pack_error(error)}
+        return {"id": number, "result": result, "state": self._state()}
 
     def _greet(self, descriptor: int, message: Mapping[str, Any]) -> None:
         """Answer the first message of a client; one that is refused is told why, and changes nothing."""
@@ -308,7 +316,7 @@ class WorldServer:
                     f"the world of the emulators has no arm {name!r}, but {names}: start each with the same rig"
                 )
             arm = self._arms_of[descriptor] = self.arms[name]
-            return {"object": arm.object_width}
+            return {"object": arm.object_width, "t": self._t}
         if role == "poses":
             return self._state()
         if "requests" in self._roles.values():
@@ -325,7 +333,6 @@ class WorldServer:
         before.close()
         for descriptor, arm in self._arms_of.items():
             self._arms_of[descriptor] = self.arms[arm.name]
-            self._send(descriptor, {"object": None})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
