@@ -32,8 +32,8 @@ class ArmInWorld:
     """An emulated arm in the world that its rig's emulators share.
 
     Attributes:
-        fingers: Width of its fingers, m, and the force with which they press on what is between them, N. Set by the
-            emulator.
+        fingers: Time of its fingers, s, their width, m, and the force with which they press on what is between them,
+            N. Set by the emulator.
         object_width: Width at which an object stops the fingers, m; None if nothing is between them.
     """
 
@@ -44,7 +44,7 @@ class ArmInWorld:
             ConnectionLost: There is no such world.
             ValueError: It has no arm of this name; lists those that it has.
         """
-        self.fingers: tuple[float, float] | None = None
+        self.fingers: tuple[float, float, float] | None = None
         connection, answer = Connection.connect(address, _START, role="arm", name=name)
         connection.sock.setblocking(False)
         self._connection: Connection | None = connection

@@ -35,6 +35,8 @@ from hal.specs import RobotSpec, WorldSpec
 
 __all__ = ["ArmOfWorld", "WorldServer", "main"]
 
+_PRIORITY = 20
+"""Among SCHED_FIFO processes, where that is allowed; a host has 50."""
 _LONGEST_GAP = 5.0
 """Time for which the world catches up, s."""
 _SILENT = 1.0
@@ -61,11 +63,12 @@ class ArmOfWorld:
         self.object_width: float | None = None
         """Width of the fingers on what is between them, m; None for nothing."""
         self._reports: deque[tuple[float, list[float]]] = deque()
+        self._reports_of_fingers: deque[tuple[float, float, float]] = deque()
         self.reported = self.heard = -math.inf
         """Time of the newest report, and when it came, s."""
         self._q: list[float] | None = None
         self._width: tuple[float, float] | None = None
-        """Time, s, and width, m, of the newest report of the fingers."""
+        """Time, s, and width, m, of the report of the fingers that counts now."""
         self._speed = self._force = 0.0
         self._target: tuple[float, float] | None = None
         self._touched_at = -1.0
@@ -88,10 +91,7 @@ class ArmOfWorld:
         self.reported = t
         self._reports.append((t, report["q"]))
         if report["fingers"] is not None:
-            width, self._force = report["fingers"]
-            if self._width is not None and t > self._width[0]:
-                self._speed = (width - self._width[1]) / (t - self._width[0])
-            self._width = (t, width)
+            self._reports_of_fingers.append(report["fingers"])
 
     def prepare_step(self, t: float, dt: float) -> None:
         """Place the arm where it is at ``t``, and drive its fingers."""
@@ -103,8 +103,16 @@ class ArmOfWorld:
                 before, dq = q, [0.0] * len(q)
             self._world.follow(self.name, before, dq)
             self._q = q
+        while self._reports_of_fingers and self._reports_of_fingers[0][0] <= t:
+            self._take_fingers(*self._reports_of_fingers.popleft())
         if self._fingers is not None and self._width is not None:
             self._drive_fingers()
+
+    def _take_fingers(self, t: float, width: float, force: float) -> None:
+        self._force = force
+        if self._width is not None and t > self._width[0]:
+            self._speed = (width - self._width[1]) / (t - self._width[0])
+        self._width = (t, width)
 
     def _interpolate(self, t: float) -> list[float]:
         reports = self._reports
@@ -361,6 +369,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (HalError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=emulator, flush=True)
         return 1
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
     print("ready", file=emulator, flush=True)
     server.run(sys.stdin.fileno())
     server.close()

@@ -289,7 +289,7 @@ class HandServer:
         now = max(self._advanced, self._fingers_time())
         if self._world is not None:
             self.fingers.meet(self._world.object_width)
-            self._world.fingers = self.fingers.width, self.fingers.pressing
+            self._world.fingers = self._advanced, self.fingers.width, self.fingers.pressing
         status = self.fingers.advance(now - self._advanced)
         self._advanced = now
         if status is not None:
