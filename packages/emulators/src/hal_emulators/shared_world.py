@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import select
 import subprocess
 import sys
@@ -14,7 +15,10 @@ from hal.config.loader import load
 from hal.drivers.scene.shared import Connection
 from hal.errors import ConnectionLost
 
-__all__ = ["ArmInWorld", "has_world", "run_world"]
+__all__ = ["PRIORITY", "ArmInWorld", "has_world", "raise_priority", "run_world"]
+
+PRIORITY = 40
+"""Of an emulator among SCHED_FIFO threads; a host has 50."""
 
 _PERIOD = 0.004
 """Time between two reports of an arm, s."""
@@ -95,6 +99,12 @@ class ArmInWorld:
         if self._connection is not None:
             self._connection.close()
         self._connection, self.object_width, self._reached = None, None, math.inf
+
+
+def raise_priority(priority: int) -> None:
+    """Run this thread, and those that it starts, before all that are not real-time, where that is allowed."""
+    with contextlib.suppress(AttributeError, OSError):  # Linux only
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def has_world(config: str, overrides: Sequence[str] = ()) -> bool:

@@ -32,11 +32,10 @@ from hal.drivers.scene.shared import Connection, address_of, check_scene, scene_
 from hal.errors import CommandError, ConnectionLost, ControlTaken, HalError
 from hal.host.process import pack_error
 from hal.specs import RobotSpec, WorldSpec
+from hal_emulators.shared_world import PRIORITY, raise_priority
 
 __all__ = ["ArmOfWorld", "WorldServer", "main"]
 
-_PRIORITY = 20
-"""Among SCHED_FIFO processes, where that is allowed; a host has 50."""
 _LONGEST_GAP = 5.0
 """Time for which the world catches up, s."""
 _SILENT = 1.0
@@ -369,8 +368,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (HalError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=emulator, flush=True)
         return 1
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+    raise_priority(PRIORITY - 10)
     print("ready", file=emulator, flush=True)
     server.run(sys.stdin.fileno())
     server.close()
