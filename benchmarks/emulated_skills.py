@@ -31,7 +31,7 @@ LIFT = 0.05
 NEAR = 0.003
 """Distance from where the cube was to be put down up to which it is there, m."""
 BUSY = ("app_silent", "command_deadline", "host_late")
-"""Codes of stops because the computer was too busy to stream set-points; a hand may also be overdue then."""
+"""Codes of stops because the computer was too busy to stream set-points; a hand or a state may also be late then."""
 MOST_STOPS = 5
 """Greatest number of them in one try."""
 CAMERA = {
@@ -129,7 +129,7 @@ def pick_and_place(rig: hal.Rig, bench: Bench, tries: int, seed: int = 0, speed:
                     arm.move_to(arm.home, speed=speed, unattended=True)
                 found = try_once(rig, at, goal, speed)
                 break
-            except (hal.MotionStopped, hal.RobotFault) as stop:
+            except (hal.MotionStopped, hal.RobotFault, hal.StaleStateError) as stop:
                 if stops == MOST_STOPS or (isinstance(stop, hal.MotionStopped) and stop.code not in BUSY):
                     raise
         yield found._replace(stops=stops)
