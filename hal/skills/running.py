@@ -34,6 +34,7 @@ Reason = Literal[
     "outside_limits",
     "collision",
     "too_wide",
+    "holding",
     "blocked",
     "fingers_blocked",
     "missed",
@@ -51,6 +52,7 @@ Reason = Literal[
 ``outside_limits``    A pose of the plan is outside the workspace or the joint limits of the rig.
 ``collision``         The way to a pose of the plan would bring the arm into itself, another arm, or a box of the rig.
 ``too_wide``          The object is wider than the gripper opens. Nothing has moved.
+``holding``           The fingers hold something already. Nothing has moved.
 ``blocked``           The arm did not get to a pose of the plan: something was in its way.
 ``fingers_blocked``   The fingers did not open as far as they should, or never came to rest.
 ``missed``            The fingers closed on nothing.
