@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ..commands import JointChunk
 from ..control import Control
-from ..errors import CommandError, DatasetError
+from ..errors import CommandError, DatasetError, RobotFault
 from ..geometry import Pose
 from ..randomization import DISTRACTORS
 from ..recording.layout import GRIP_FORCE
-from ..types import Limited, RobotStatus
+from ..types import GripperOutcome, Limited, RobotStatus
 
 if TYPE_CHECKING:
     from ..deadman import Deadman
@@ -37,6 +37,10 @@ _JITTER = 0.010
 moved faster between two neighbours than it did."""
 _MOVED = 0.01
 """Motion below which an arm counts as standing still, rad, or m of a gripper."""
+_FINGERS_REST = 0.01
+"""Speed of a width up to which the fingers count as resting, m/s."""
+_ARM_RESTS = 0.02
+"""Speed of the joints up to which the arm counts as resting, rad/s."""
 _OBJECT = "rig.object."
 
 
@@ -58,6 +62,8 @@ class RecordedTrajectory:
     grip: Array | None
     """(k, 2) commanded widths, m, and forces, N, of the gripper; None without one. A force is NaN where the recording
     lacks it."""
+    width: Array | None
+    """(k,) measured widths of the gripper, m; None without one."""
     objects: Mapping[str, Pose]
     """Poses of the objects in the first row, in the world; simulation only."""
     randomization: Mapping[str, Any] | None
@@ -109,6 +115,7 @@ class RecordedTrajectory:
             t=t[later],
             q_set=setpoint[:, :n],
             q=rows("observation.state", own)[:, :n],
+            width=rows("observation.state", own)[:, n] if has_gripper else None,
             tcp=rows("observation.tcp", slice(first, first + 3)),
             grip=np.stack([setpoint[:, n], forces], axis=1) if has_gripper else None,
             objects=_distractors(episode.info) | _objects(episode.columns),
@@ -119,6 +126,19 @@ class RecordedTrajectory:
     def duration(self) -> float:
         """Time from the first row to the last, s."""
         return float(self.t[-1])
+
+    def find_waits(self) -> list[float]:
+        """Return when the fingers came to rest while the arm rested, which may have waited for them, s since the start.
+
+        The last row at which they moved counts, or the one before if the arm has left by then.
+        """
+        if self.width is None:
+            return []
+        took = np.diff(self.t)
+        moved = np.abs(np.diff(self.width)) > _FINGERS_REST * took
+        rests = np.abs(np.diff(self.q_set, axis=0)).max(axis=1) <= _ARM_RESTS * took
+        ends = np.flatnonzero(moved[1:-1] & ~moved[2:]) + 2
+        return [float(self.t[k] if rests[k - 1] else self.t[k - 1]) for k in ends if rests[k - 2]]
 
     def check(self, robot: Robot, speed: float) -> None:
         """Check whether an arm can follow the trajectory.
@@ -302,6 +322,8 @@ _RAMP = 0.3
 """Time in which playback reaches its speed, s: a pause may have been in the middle of a motion."""
 _JOIN = 0.3
 """Shortest time in which the arm is brought from rest to the point at which it continues, s."""
+_LONGEST_WAIT = 10.0
+"""Time after which fingers that have not come to rest end the playback, s."""
 _SETTLE = 0.5
 """Time for which the last set-point is held, s."""
 
@@ -335,6 +357,9 @@ class TrajectoryPlayer:
 
     While the dead-man is not held, the episode's time stands still: what was sent ahead is dropped, and after a new
     press the arm returns to where it stopped and continues from there. A trip ends the playback with MotionStopped.
+
+    Where the arm rested in the recording until the fingers did, it rests here until these fingers do, so that a hand
+    which takes longer than the recorded one has closed before the arm lifts, and has opened before it leaves.
     """
 
     def __init__(
@@ -370,6 +395,9 @@ class TrajectoryPlayer:
         self.pauses = 0
         self.progress = 0.0
         """Progress in the episode, s since the first row."""
+        self._waits = trajectory.find_waits()
+        self._wait_ends = math.inf
+        """Time at which the present wait for the fingers counts as too long, s on the clock."""
         self.finished = False
 
     def approach(self, patience: float = 60.0) -> None:
@@ -409,7 +437,7 @@ class TrajectoryPlayer:
 
         Raises:
             MotionStopped: After a trip.
-            RobotFault: The robot reports a fault.
+            RobotFault: The robot reports a fault, or the fingers do not come to rest where they did in the recording.
             ConnectionLost: The arm is lost.
         """
         clock, scaling, turn = self.rig.clock, None, 0
@@ -424,6 +452,12 @@ class TrajectoryPlayer:
                     scaling, seen = None, tick.t
                     on_turn(self, False)
                     continue
+                if self._waits_for_fingers(tick.t):
+                    scaling, seen = None, tick.t
+                    control.hold_for(_AHEAD)
+                    self._grip(control)
+                    on_turn(self, True)
+                    continue
                 if scaling is None:
                     scaling, turn = self._begin(tick.t), 0
                 if turn % _EVERY == 0:
@@ -435,6 +469,23 @@ class TrajectoryPlayer:
                 if tick.t >= scaling.time_at(self.trajectory.duration) + _SETTLE / 2.0:
                     self.finished = True
                     return
+
+    def _waits_for_fingers(self, now: float) -> bool:
+        """Return whether the arm has to rest because the fingers, unlike the recorded ones, do not rest yet."""
+        gripper, grip = self.robot.gripper, self.trajectory.grip_at(self.progress)
+        if gripper is None or grip is None or gripper.trouble or not self._waits or self.progress < self._waits[0]:
+            return False
+        state = gripper.state()
+        taken = abs(state.width_target - grip[0]) <= _MOVED
+        if taken and not state.moving and state.outcome is not GripperOutcome.RUNNING:
+            self._waits = [wait for wait in self._waits if wait > self.progress]
+            self._wait_ends = math.inf
+            return False
+        self._wait_ends = min(self._wait_ends, now + _LONGEST_WAIT)
+        if now > self._wait_ends:
+            cause = f"{gripper.name} does not come to rest, as it did in the recording: {state.width:.4f} m"
+            raise RobotFault(cause, "see what is in the way of the fingers")
+        return True
 
     def _clip(self, q: Array) -> Array:
         """Return ``q`` within the limits: rounding may have moved a recorded set-point out of them."""

@@ -153,6 +153,7 @@ def run_grasp(
     hold = number("hold", hold, "s", least=0.0)
     with run:
         before, at, q = plan_grasp(run, pose, width, approach, lift, flip)
+        check_free(run)
         run.begin("open")
         run.set_fingers()
         run.approach(before, q, at)
@@ -164,6 +165,15 @@ def run_grasp(
             run.set_fingers()
             run.move(before)
     return run.result()
+
+
+def check_free(run: SkillRun) -> None:
+    """Fail as ``holding`` if the fingers hold something, which would fall when they open."""
+    gripper = run.gripper
+    state = gripper.state()
+    if state.grasped:
+        text = f"{gripper.name} holds something already, {state.width:.3f} m wide"
+        run.fail("holding", f"{text}: put it down, and open the fingers (gripper.open())")
 
 
 def plan_grasp(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from types import TracebackType
@@ -31,6 +32,7 @@ Reason = Literal[
     "outside_limits",
     "collision",
     "too_wide",
+    "holding",
     "blocked",
     "fingers_blocked",
     "missed",
@@ -48,6 +50,7 @@ Reason = Literal[
 ``outside_limits``    A pose of the plan is outside the workspace or the joint limits of the rig.
 ``collision``         The way to a pose of the plan would bring the arm into itself, another arm, or a box of the rig.
 ``too_wide``          The object is wider than the gripper opens. Nothing has moved.
+``holding``           The fingers hold something already. Nothing has moved.
 ``blocked``           The arm did not get to a pose of the plan: something was in its way.
 ``fingers_blocked``   The fingers did not open as far as they should, or never came to rest.
 ``missed``            The fingers closed on nothing.
@@ -328,15 +331,15 @@ class SkillRun:
         start = arm.state()
         low = min(start.tcp_set.position[2], pose.position[2]) - _SINK
         steps = np.linspace(0.0, 1.0, _STEPS)[:, None]
-        if all(arm.fk(each).position[2] > low for each in start.q_set + steps * (q - start.q_set)):
-            self._move(pose, q)
-            return
-        middle = 0.5 * (start.tcp_set.position + pose.position)
+        way = q
+        if any(arm.fk(each).position[2] <= low for each in start.q_set + steps * (q - start.q_set)):
+            middle = 0.5 * (start.tcp_set.position + pose.position)
+            with suppress(Unreachable):
+                way = np.array([arm.ik(lift_pose(Pose(middle, pose.orientation), _RAISE), q), q])
         try:
-            over = arm.ik(lift_pose(Pose(middle, pose.orientation), _RAISE), q)
-        except Unreachable:
-            over = q
-        self._move(pose, np.array([over, q]))
+            self._move(pose, way)
+        except Unreachable as error:  # the way leaves the workspace; nothing has moved
+            self.fail("unreachable", str(error))
 
     def move(self, pose: Pose, *, tcp_speed: float = _NEAR_SPEED) -> None:
         """Move the tcp a short way to a pose near by: on a straight line, or in joint space where that cannot be.

@@ -321,3 +321,26 @@ def test_other_connections_are_closed():
             assert stranger.recv(10) == b""
         bench.hand.open()
         assert bench.read().width == 0.04
+
+
+class LateWorld:
+    """A simulated world that is late."""
+
+    LAG = 0.5
+    object_width = None
+    fingers = None
+
+    @property
+    def now(self) -> float:
+        return time.monotonic()
+
+    @property
+    def now_of_fingers(self) -> float:
+        return time.monotonic() - self.LAG
+
+
+def test_fingers_wait_until_a_late_world_has_reached_their_command():
+    with HandBench(world=LateWorld()) as bench:
+        began = time.monotonic()
+        bench.do("move", 0.08, 0.1, 40.0)
+        assert time.monotonic() - began > 0.4 + LateWorld.LAG, "the way of 40 mm takes 0.4 s"

@@ -11,6 +11,7 @@ import pytest
 from errors_kit import raises_code
 
 import hal
+from hal.learning import replay as replay_module
 from hal.learning.replay import Deviation, RecordedTrajectory, TrajectoryPlayer, list_other_arms, list_recorded_arms
 
 FPS = 30
@@ -44,8 +45,10 @@ def twist(t: float) -> hal.Twist:
     return hal.Twist([0.12 * np.sin(1.5 * t), 0.15 * np.cos(2.0 * t), -0.05 * np.sin(t)], [0.0, 0.2 * np.sin(t), 0.3])
 
 
-def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = None) -> Recorded:
-    """Drive, close the hand half-way, and keep a row at every turn."""
+def record(
+    driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = None, rest: tuple[float, float] = (0.0, 0.0)
+) -> Recorded:
+    """Drive, close the hand half-way, and keep a row at every turn; the arm rests from some time to another one, s."""
     names = ("rig.setpoint", "rig.setpoint_force", "observation.state", "observation.tcp", "rig.object.cube")
     rows: dict[str, list[Any]] = {key: [] for key in names}
     stamps = []
@@ -56,7 +59,11 @@ def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = N
             rig.world.reset("cube", pose=cube)
         with arm.control(rate_hz=FPS) as control:
             for tick in rig.clock.rate(FPS):
-                control.send(twist(tick.elapsed), grip=0.0 if tick.elapsed < seconds / 2 else 0.8)
+                rests = rest[0] <= tick.elapsed < rest[1]
+                control.send(
+                    hal.Twist([0.0] * 3) if rests else twist(tick.elapsed),
+                    grip=0.0 if tick.elapsed < seconds / 2 else 0.8,
+                )
                 state, hand = arm.state(), arm.gripper.state()
                 stamps.append(state.stamp.t)
                 rows["rig.setpoint"].append([*state.q_set, hand.width_target])
@@ -112,6 +119,41 @@ def test_a_replay_is_where_the_recording_was(driver: str, speed: float) -> None:
     for place, width in widths:
         if not 1.9 < place < 2.8:  # not while the fingers are on their way, at a speed of their own
             assert width == pytest.approx(np.interp(place, player.trajectory.t, recorded), abs=0.012)
+
+
+def test_an_arm_that_rested_for_the_fingers_waits_for_slower_ones() -> None:
+    episode = record(rest=(1.0, 3.0))
+    with opened("mock", overrides=[*BARE, "robots.panda.gripper.speed=0.02"]) as rig:
+        arm = rig.robots["panda"]
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm))
+        (wait,) = player.trajectory.find_waits()
+        player.approach()
+        fastest = dict.fromkeys((False, True), 0.0)
+
+        def on_turn(player: TrajectoryPlayer, plays: bool) -> None:
+            late = arm.gripper.state().width > 0.02
+            if late and player.progress > 1.7:
+                assert player.progress < wait + 0.03
+            if player.progress > 1.7:
+                fastest[late] = max(fastest[late], float(np.abs(arm.state().dq_set).max()))
+
+        player.play(on_turn)
+        assert player.finished
+        assert fastest[True] < 0.01, "it rests until they have closed"
+        assert fastest[False] > 0.1
+        assert player.deviation.tcp[0] < 0.01
+
+
+def test_fingers_that_never_rest_end_the_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_module, "_LONGEST_WAIT", 0.5)
+    episode = record(rest=(1.0, 3.0))
+    with opened("mock", overrides=[*BARE, "robots.panda.gripper.speed=0.002"]) as rig:
+        arm = rig.robots["panda"]
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm))
+        player.approach()
+        with pytest.raises(hal.RobotFault, match="does not come to rest"):
+            player.play()
+        assert np.abs(arm.state().dq_set).max() < 1e-6
 
 
 def test_objects_are_put_back_to_their_recorded_poses() -> None:

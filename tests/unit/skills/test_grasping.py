@@ -31,7 +31,8 @@ def rig(opened: hal.Rig) -> hal.Rig:
     opened.driver("panda.gripper").clear()
     opened.driver("panda.gripper").inject(object_width=WIDTH)
     opened.driver("pad").release("l2")
-    opened.clock.sleep(0.1)
+    assert arm.gripper is not None
+    arm.gripper.move(0.045)
     arm.move_to(arm.home, speed=1.0)
     return opened
 
@@ -79,7 +80,7 @@ def test_what_goes_wrong_at_the_fingers(
     arm, gripper = rig.robots["panda"], rig.driver("panda.gripper")
     if reason == "fingers_blocked":
         assert arm.gripper is not None
-        arm.gripper.grip(1.0)
+        arm.gripper.grip(0.3)
     result = grasp(
         arm,
         POSE,
@@ -91,6 +92,18 @@ def test_what_goes_wrong_at_the_fingers(
     if reason in ("missed", "wrong_width"):
         assert result.width == pytest.approx(0.08, abs=1e-3), "the fingers are open again"
         assert result.tcp.position[2] > 0.19, "and the hand is out of the way"
+
+
+def test_what_the_fingers_hold_already_is_not_dropped(rig: hal.Rig) -> None:
+    arm = rig.robots["panda"]
+    assert arm.gripper is not None
+    assert arm.gripper.grasp(WIDTH)
+    seen = list[SkillProgress]()
+    result = grasp(arm, POSE, width=WIDTH, speed=1.0, progress=seen.append)
+    assert (result.reason, result.phase, seen) == ("holding", "plan", [])
+    assert arm.gripper.state().grasped
+    arm.gripper.move(0.045)
+    assert grasp(arm, POSE, width=WIDTH, speed=1.0)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +139,8 @@ def test_the_nearer_of_two_equal_grasps_is_taken(rig: hal.Rig) -> None:
     assert result
     assert result.tcp.distance(turned)[1] == pytest.approx(3.14, abs=0.02), "the hand is turned by half a turn"
     arm.move_to(arm.home, speed=1.0)
+    assert arm.gripper is not None
+    arm.gripper.open()
     assert grasp(arm, turned, speed=1.0, flip=False).tcp.distance(turned)[1] == pytest.approx(0.0, abs=0.02)
 
 
@@ -147,7 +162,7 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
     pad, deadman = rig.driver("pad"), rig.gamepads["pad"].hold("l2")
     log = rig.driver("panda.gripper").log
     pauses = dict.fromkeys(PHASES, 0)
-    rig.robots["panda"].gripper.grip(1.0)  # so that there is something to open
+    rig.robots["panda"].gripper.grip(0.3)  # so that there is something to open
     pad.press("l2")
 
     def pause(now: SkillProgress) -> None:
@@ -172,6 +187,7 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
     assert len(log) - before >= 3, "opened, closed, and closed again after the pause"
     assert result.duration > 5.0
 
+    rig.robots["panda"].gripper.open()
     with raises_code(hal.MotionStopped, "deadman_released"):
         grasp(
             rig.robots["panda"],
@@ -188,7 +204,7 @@ def test_a_skill_ends_after_its_timeout_in_every_phase(rig: hal.Rig, phase: str)
     """A dead-man that is released for ever pauses the skill until then, however long it may be released."""
     pad, arm = rig.driver("pad"), rig.robots["panda"]
     deadman = rig.gamepads["pad"].hold("l2")  # before it is pressed: a skill begins with a new press
-    arm.gripper.grip(1.0)
+    arm.gripper.grip(0.3)
     pad.press("l2")
     rig.clock.sleep(0.1)
     begun = list[float]()

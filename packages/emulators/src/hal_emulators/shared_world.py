@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import os
 import select
 import subprocess
 import sys
@@ -13,12 +15,17 @@ from hal.config.loader import load
 from hal.drivers.scene.shared import Connection
 from hal.errors import ConnectionLost
 
+PRIORITY = 40
+"""Of an emulator among SCHED_FIFO threads; a host has 50."""
+
 _PERIOD = 0.004
 """Time between two reports of an arm, s."""
 _START = 60.0
 """Longest time that the program of the world takes to get ready, s: the first time it reads large meshes."""
 _END = 5.0
 """Longest time that it takes to end, s."""
+_LEAD = 0.03
+"""Time, s, by which an arm's fingers may be ahead of the world, whose messages take about 0.01 s."""
 _AT_REST = 4e-6
 """Motion of a joint between two reports, rad, below which the arm counts as being at rest."""
 
@@ -27,8 +34,8 @@ class ArmInWorld:
     """An emulated arm in the world that its rig's emulators share.
 
     Attributes:
-        fingers: Width of its fingers, m, and the force with which they press on what is between them, N. Set by the
-            emulator.
+        fingers: Time of its fingers, s, their width, m, and the force with which they press on what is between them,
+            N. Set by the emulator.
         object_width: Width at which an object stops the fingers, m; None if nothing is between them.
     """
 
@@ -39,15 +46,30 @@ class ArmInWorld:
             ConnectionLost: There is no such world.
             ValueError: It has no arm of this name; lists those that it has.
         """
-        self.fingers: tuple[float, float] | None = None
+        self.fingers: tuple[float, float, float] | None = None
         connection, answer = Connection.connect(address, _START, role="arm", name=name)
         connection.sock.setblocking(False)
         self._connection: Connection | None = connection
         self.object_width: float | None = answer["object"]
+        self._reached: float = answer["t"]
+        """Time that the world has reached, s; infinite once it is lost."""
         self._t = time.monotonic()
         """Time of the arm, s: it falls behind where the emulator is late, so that no motion in the world is faster."""
         self._due = self._t
         self._q: list[float] = []
+
+    @property
+    def now(self) -> float:
+        """Time of the arm, s; what comes from its client is for this time."""
+        return self._t
+
+    @property
+    def now_of_fingers(self) -> float:
+        """Time of the fingers, s: that of the arm, but hardly ahead of the world, which is late on a busy computer.
+
+        Fingers that close before the world's arm has come to the object would miss it.
+        """
+        return min(self._t, self._reached + _LEAD)
 
     def exchange(self, dt: float, q: Sequence[float]) -> None:
         """Report the joint positions (n,), rad, after a cycle of ``dt`` s, and take what the world says."""
@@ -68,13 +90,19 @@ class ArmInWorld:
             print(f"warning: {error}; until then the fingers meet no objects", file=sys.stderr, flush=True)
             return
         if answer is not None:
-            self.object_width = answer["object"]
+            self.object_width, self._reached = answer["object"], answer["t"]
 
     def close(self) -> None:
         """Leave the world."""
         if self._connection is not None:
             self._connection.close()
-        self._connection, self.object_width = None, None
+        self._connection, self.object_width, self._reached = None, None, math.inf
+
+
+def raise_priority(priority: int) -> None:
+    """Run this thread, and those that it starts, before all that are not real-time, where that is allowed."""
+    with contextlib.suppress(AttributeError, OSError):  # Linux only
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def has_world(config: str, overrides: Sequence[str] = ()) -> bool:

@@ -32,6 +32,7 @@ from hal.drivers.scene.shared import Connection, address_of, check_scene, scene_
 from hal.errors import CommandError, ConnectionLost, ControlTaken, HalError
 from hal.host.process import pack_error
 from hal.specs import RobotSpec, WorldSpec
+from hal_emulators.shared_world import PRIORITY, raise_priority
 
 _LONGEST_GAP = 5.0
 """Time for which the world catches up, s."""
@@ -59,11 +60,12 @@ class ArmOfWorld:
         self.object_width: float | None = None
         """Width of the fingers on what is between them, m; None for nothing."""
         self._reports: deque[tuple[float, list[float]]] = deque()
+        self._reports_of_fingers: deque[tuple[float, float, float]] = deque()
         self.reported = self.heard = -math.inf
         """Time of the newest report, and when it came, s."""
         self._q: list[float] | None = None
         self._width: tuple[float, float] | None = None
-        """Time, s, and width, m, of the newest report of the fingers."""
+        """Time, s, and width, m, of the report of the fingers that counts now."""
         self._speed = self._force = 0.0
         self._target: tuple[float, float] | None = None
         self._touched_at = -1.0
@@ -86,10 +88,7 @@ class ArmOfWorld:
         self.reported = t
         self._reports.append((t, report["q"]))
         if report["fingers"] is not None:
-            width, self._force = report["fingers"]
-            if self._width is not None and t > self._width[0]:
-                self._speed = (width - self._width[1]) / (t - self._width[0])
-            self._width = (t, width)
+            self._reports_of_fingers.append(report["fingers"])
 
     def prepare_step(self, t: float, dt: float) -> None:
         """Place the arm where it is at ``t``, and drive its fingers."""
@@ -101,8 +100,16 @@ class ArmOfWorld:
                 before, dq = q, [0.0] * len(q)
             self._world.follow(self.name, before, dq)
             self._q = q
+        while self._reports_of_fingers and self._reports_of_fingers[0][0] <= t:
+            self._take_fingers(*self._reports_of_fingers.popleft())
         if self._fingers is not None and self._width is not None:
             self._drive_fingers()
+
+    def _take_fingers(self, t: float, width: float, force: float) -> None:
+        self._force = force
+        if self._width is not None and t > self._width[0]:
+            self._speed = (width - self._width[1]) / (t - self._width[0])
+        self._width = (t, width)
 
     def _interpolate(self, t: float) -> list[float]:
         reports = self._reports
@@ -129,19 +136,16 @@ class ArmOfWorld:
             self._target = wanted
             fingers.move(wanted[0], spec.speed, wanted[1])
 
-    def finish_step(self, t: float) -> bool:
-        """Find out what the fingers touch; return whether the emulator has to know."""
+    def finish_step(self, t: float) -> None:
+        """Find out what the fingers touch."""
         if self._fingers is None:
-            return False
+            return
         width = self._fingers.read(t).width
-        before = self.object_width
         if self._is_between():
             self._touched_at = t
             self.object_width = width
         elif t > self._touched_at + _TOUCHED:
             self.object_width = None
-        now = self.object_width
-        return now != before if now is None or before is None else abs(now - before) > 1e-6
 
     def _is_between(self) -> bool:
         """Return whether both fingers touch one thing, from opposite sides."""
@@ -179,6 +183,8 @@ class WorldServer:
         self._clients: dict[int, Connection] = {}
         self._roles: dict[int, str] = {}
         self._arms_of: dict[int, ArmOfWorld] = {}
+        self._requests: deque[tuple[float, int, int, str, dict[str, Any]]] = deque()
+        """Time of the world for which a request is, s, the client that waits for the answer, and the request."""
         self._t = time.monotonic()
         """Time of the step that was made last, s."""
         self._build()
@@ -207,6 +213,7 @@ class WorldServer:
             if self._t + dt <= reported:
                 self._t += dt
                 self._step(self._t, dt)
+            self._answer_due(self._t + dt)
             ready = self._t + dt <= reported
             for descriptor, _ in self._poller.poll(0.0 if ready else dt):
                 if descriptor == until:
@@ -231,10 +238,10 @@ class WorldServer:
         for arm in self.arms.values():
             arm.prepare_step(t, dt)
         self.world.step()
-        changed = {name for name, arm in self.arms.items() if arm.finish_step(t)}
+        for arm in self.arms.values():
+            arm.finish_step(t)
         for descriptor, arm in self._arms_of.items():
-            if arm.name in changed:
-                self._send(descriptor, {"object": arm.object_width})
+            self._send(descriptor, {"object": arm.object_width, "t": t})
         watching = [descriptor for descriptor, role in self._roles.items() if role == "poses"]
         if watching:
             state = self._state()
@@ -264,7 +271,8 @@ class WorldServer:
                 elif descriptor in self._arms_of:
                     self._arms_of[descriptor].take(message)
                 else:
-                    client.send(self._answer(message))
+                    request = message["id"], message["method"], message["params"]
+                    self._requests.append((self._reported(time.monotonic()), descriptor, *request))
         except ConnectionLost:
             self._drop(descriptor)
         except Exception:  # of what this client sent: the world goes on without it
@@ -274,17 +282,24 @@ class WorldServer:
     def _drop(self, descriptor: int) -> None:
         client = self._clients.pop(descriptor)
         self._poller.unregister(client.sock)
-        self._roles.pop(descriptor, None)
+        if self._roles.pop(descriptor, None) == "requests":
+            self._requests.clear()
         self._arms_of.pop(descriptor, None)
         client.close()
 
-    def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
+    def _answer_due(self, t: float) -> None:
+        """Answer the requests that came before ``t``: a late world has caught up with what their clients knew."""
+        while self._requests and self._requests[0][0] <= t:
+            _, descriptor, number, method, params = self._requests.popleft()
+            self._send(descriptor, self._answer(number, method, params))
+
+    def _answer(self, number: int, method: str, params: dict[str, Any]) -> dict[str, Any]:
         """Return the answer to a request of :class:`.shared.SharedWorld`, with the state after it."""
         try:
-            result = self.world.request(message["method"], message["params"])
+            result = self.world.request(method, params)
         except Exception as error:
-            return {"id": message["id"], "error": pack_error(error)}
-        return {"id": message["id"], "result": result, "state": self._state()}
+            return {"id": number, "error": pack_error(error)}
+        return {"id": number, "result": result, "state": self._state()}
 
     def _greet(self, descriptor: int, message: Mapping[str, Any]) -> None:
         """Answer the first message of a client; one that is refused is told why, and changes nothing."""
@@ -306,7 +321,7 @@ class WorldServer:
                     f"the world of the emulators has no arm {name!r}, but {names}: start each with the same rig"
                 )
             arm = self._arms_of[descriptor] = self.arms[name]
-            return {"object": arm.object_width}
+            return {"object": arm.object_width, "t": self._t}
         if role == "poses":
             return self._state()
         if "requests" in self._roles.values():
@@ -323,7 +338,6 @@ class WorldServer:
         before.close()
         for descriptor, arm in self._arms_of.items():
             self._arms_of[descriptor] = self.arms[arm.name]
-            self._send(descriptor, {"object": None})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -352,6 +366,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (HalError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=emulator, flush=True)
         return 1
+    raise_priority(PRIORITY - 10)
     print("ready", file=emulator, flush=True)
     server.run(sys.stdin.fileno())
     server.close()

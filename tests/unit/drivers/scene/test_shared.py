@@ -129,3 +129,20 @@ def test_a_late_answer_is_not_taken_for_the_next(spec: WorldSpec, monkeypatch: p
             world.request("pose", {"name": "floor"})
         go_on.set()
         assert world.request("names", {}) == ["floor", "arm"]
+
+
+def test_fingers_and_programs_wait_for_a_late_world(spec: WorldSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    with serve(spec) as server, contextlib.closing(join(spec)) as world:
+        arm = ArmInWorld(address_of(spec.robots[0]), "arm")
+        step, go_on = server.world.step, threading.Event()
+
+        def be_late() -> None:
+            assert go_on.wait(10.0)
+            step()
+
+        monkeypatch.setattr(server.world, "step", be_late)
+        wait_until(lambda: arm.exchange(0.005, [0.0] * 6) or arm.now > arm.now_of_fingers + 0.2, "the fingers wait")
+        threading.Timer(0.1, go_on.set).start()
+        world.request("names", {})
+        assert world.stamp(0.0) > arm.now - 0.01, "the answer is of the world that the program has asked about"
+        wait_until(lambda: arm.exchange(0.005, [0.0] * 6) or arm.now == arm.now_of_fingers, "they go on")

@@ -242,7 +242,7 @@ class EmulatedDamiaoArm:
         closing = -gripper.tau * math.copysign(1.0, slope) - gripper.coulomb
         width = w0 + (gripper.q - a0) * slope
         pressing = self._object_width is not None and width < self._object_width + _NEAR
-        world.fingers = width, max(closing / abs(slope), 0.0) if pressing else 0.0
+        world.fingers = world.now, width, max(closing / abs(slope), 0.0) if pressing else 0.0
 
     def report(self) -> dict[str, Any]:
         """Return the state of every motor, for programs and people."""

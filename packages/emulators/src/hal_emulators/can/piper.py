@@ -197,7 +197,8 @@ class EmulatedPiperArm:
             self._object = self.world.object_width or 0.0
         self._step_gripper(dt)
         if self.world is not None:
-            self.world.fingers = self.gripper_width, -self._gripper_torque * self._force_per_torque
+            force = -self._gripper_torque * self._force_per_torque
+            self.world.fingers = self.world.now, self.gripper_width, force
             self.world.exchange(dt, self.plant.q.tolist())
         self._since_report += dt
         self._since_slow += dt

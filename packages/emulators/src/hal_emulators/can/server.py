@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import heapq
 import itertools
-import os
 import random
 import threading
 import time
@@ -23,7 +22,7 @@ from hal.config.loader import load
 from hal.drivers.can.settings import BusSettings
 from hal.drivers.scene.shared import address_of
 from hal.specs import RobotSpec
-from hal_emulators.shared_world import ArmInWorld
+from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .damiao import EmulatedDamiaoArm
 from .piper import EmulatedPiperArm
@@ -33,8 +32,6 @@ _STEP = 1e-3
 """Step of the mechanics, s."""
 _LONGEST_GAP = 0.25
 """Time that the mechanics make up for after the machine had no time for them, s."""
-_PRIORITY = 40
-"""Of a bus's thread among SCHED_FIFO threads; a host has 50."""
 _ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": EmulatedDamiaoArm, "piper": EmulatedPiperArm}
 
 
@@ -173,8 +170,7 @@ class EmulatedBus:
 
     def _run(self) -> None:
         if self._realtime:
-            with contextlib.suppress(AttributeError, OSError):  # Linux only, and only where it is allowed
-                os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+            raise_priority(PRIORITY)
         try:
             self._serve()
         except Exception as error:  # reported by whoever looks at it

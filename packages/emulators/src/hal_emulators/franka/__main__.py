@@ -17,7 +17,7 @@ from hal.drivers.franka.limits import LIMITS
 from hal.drivers.scene.shared import address_of
 from hal.errors import HalError
 from hal_emulators.control import CONTROL_PORT
-from hal_emulators.shared_world import ArmInWorld, run_world
+from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority, run_world
 
 from .arm import EmulatedArm, RobotFiles
 from .console import CommandConsole, Executor
@@ -162,6 +162,7 @@ def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | 
             f"{options.config} has no Franka at {options.host}: change --host, or --set robots.NAME.real.host"
         )
     stack.enter_context(run_world(options.config, options.set))
+    raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
     world = ArmInWorld(address_of(arm), arm.name)
     stack.callback(world.close)
     return world

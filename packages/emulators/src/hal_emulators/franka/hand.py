@@ -12,6 +12,7 @@ import socketserver
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -139,7 +140,10 @@ class HandServer:
         self._ending = threading.Event()
         self._running: HandRequest | None = None
         """Running motion, whose answer is pending."""
-        self._born = self._advanced = self._next_state = time.monotonic()
+        self._born = self._next_state = time.monotonic()
+        self._advanced = self._fingers_time()
+        self._waiting: deque[tuple[float, HandRequest]] = deque()
+        """Requests that the fingers have not reached yet, with the time at which each came, s."""
         self._back_at = 0.0
         self._thread = threading.Thread(target=self._run, name="franka-hand", daemon=True)
 
@@ -243,9 +247,15 @@ class HandServer:
         while not self._ending.is_set():
             keys = self._network.wait(self._time_to_next())
             with self._lock:
-                for request in self._network.receive(keys):
-                    self._serve(request)
+                came = time.monotonic() if self._world is None else self._world.now
+                self._waiting.extend((came, request) for request in self._network.receive(keys))
+                while self._waiting and self._waiting[0][0] <= self._fingers_time():
+                    self._serve(self._waiting.popleft()[1])
                 self._step()
+
+    def _fingers_time(self) -> float:
+        """Return the time of the fingers, s: in a simulated world, the time up to which that is known."""
+        return time.monotonic() if self._world is None else self._world.now_of_fingers
 
     def _time_to_next(self) -> float:
         """Return the time until the next step is due, s."""
@@ -255,7 +265,7 @@ class HandServer:
             if client is not None:
                 due += [self._next_state, client.due]
             if self._world is not None:
-                due.append(self._advanced + _WORLD_STEP)
+                due.append(now + _WORLD_STEP)
             elif self.fingers.motion is not None:
                 due.append(self._advanced + _STEP)
             if not self._network.listening:
@@ -266,17 +276,18 @@ class HandServer:
         now = time.monotonic()
         if not self._network.listening and now >= self._back_at:
             self._network.listen()
-        self._advance(now)
+        self._advance()
         if now >= self._next_state:
             self._next_state = max(now, self._next_state + self.period)
             if now >= self.faults.silent_until:
                 self._network.send_state(self._report(now))
         self._network.send_answers(now)
 
-    def _advance(self, now: float) -> None:
+    def _advance(self) -> None:
+        now = max(self._advanced, self._fingers_time())
         if self._world is not None:
             self.fingers.meet(self._world.object_width)
-            self._world.fingers = self.fingers.width, self.fingers.pressing
+            self._world.fingers = self._advanced, self.fingers.width, self.fingers.pressing
         status = self.fingers.advance(now - self._advanced)
         self._advanced = now
         if status is not None:
@@ -293,7 +304,7 @@ class HandServer:
         name = request.code.name.lower()
         self._requests[name] += 1
         self._newest[name] = request.values
-        self._advance(time.monotonic())
+        self._advance()
         if request.code is HandCode.CONNECT:
             self._connect(request)
         elif request.code is HandCode.STOP:
