@@ -13,6 +13,7 @@ from importlib import import_module
 import gymnasium
 import numpy as np
 
+from hal.errors import CommandError
 from hal.gym import TaskEnv
 from hal.learning.tasks import TASKS
 from hal.learning.tasks.by_depth import DepthJudge
@@ -39,12 +40,16 @@ def run_episode(env: gymnasium.Env, seed: int, scripted: bool) -> tuple[float, b
     env.action_space.seed(seed)
     task = env.unwrapped
     assert isinstance(task, TaskEnv)
-    total = 0.0
-    for action in task.solve() if scripted else (env.action_space.sample() for _ in itertools.count()):
-        _, reward, terminated, truncated, info = env.step(action)
-        total += float(reward)
-        if terminated or truncated:
-            break
+    total, info = 0.0, {"success": False}
+    try:
+        for action in task.solve() if scripted else (env.action_space.sample() for _ in itertools.count()):
+            _, reward, terminated, truncated, info = env.step(action)
+            total += float(reward)
+            if terminated or truncated:
+                break
+    except CommandError as error:  # an episode that fails, as any other
+        if error.code != "not_arrived":
+            raise
     return total, info["success"]
 
 

@@ -189,6 +189,7 @@ class Motors:
                 limited[joint], signs[joint] = True, np.sign(torques[joint])
             self.applied[arm] = np.clip(torques, -most, most)
             self.wanted[arm[limited]] = self._dq[arm[limited]] + self.h * acceleration[limited]
+            self.boost[arm[limited]] = 0.0  # a contact would wind it up, also away from the target
 
     def inertia(self, data: Any, at: slice | NDArray[np.intp]) -> Array:
         """Return the joint-space inertia (k, k), kg m2, of the joints at these places, of the state in ``data``."""

@@ -242,9 +242,12 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def _start(self, speed: float, force: float) -> None:
         self._expect_open()
+        width, _, pressed, _ = self._measure()
+        blocked = abs(width - self._stood) <= STILL and pressed >= PRESSING * self._force
+        if not blocked or force != self._force or self._target > width - AT_TARGET:  # else nothing moves
+            self._resting, self._stood_since = False, self.scene.steps
         self._force = force
         self._speed = min(speed, self.spec.speed)
-        self._resting, self._stood_since = False, self.scene.steps
         self._settle = max(SETTLE, 2.0 * STILL / self._speed) + self._disturbances.commands.steps * self.scene.dt
         self._engage(True)
         self._send(self._speed)

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import CommandError, NotSupported, Unreachable
-from ...geometry import Pose
+from ...geometry import Pose, difference
 from ...gripper import Gripper
 from ...observation import Observation
 from ...robot import Robot
 from ..gym import RigEnv
+from ..spaces import pose_array
 
 Array = NDArray[np.float64]
 
@@ -20,6 +21,11 @@ GRASP_HEIGHT = 0.03
 """Height of the tcp over the table at which fingers grasp what stands on it, m."""
 UPRIGHT_GAIN = 6.0
 """Speed of the turn that keeps the hand upright for each radian that it leans, 1/s."""
+_AROUND = 0.025
+"""Distance of the tcp from an object below which the fingers are around it, m; on top of it they are farther away."""
+_LEAD = (0.01, 0.05)
+"""Greatest lead of the set-point, m and rad, over a simulated hand that something holds back: more of it would stop the
+arm, mostly while a policy explores around an object."""
 _FREE = 0.01
 """How much wider than an object the fingers must open, m."""
 _STILL = 0.2
@@ -76,16 +82,46 @@ class Hand:
         near = np.linalg.norm(thing.transform(at) - self.tcp.position) < GRASP_HEIGHT
         return bool(near) and bool(self.seen.grippers[self.robot.name].grasped)
 
+    def measure_grasp(self, thing: Pose, at: ArrayLike = (0.0, 0.0, 0.0)) -> float:
+        """Return how far the grasp of an object at a point of it (3,), m, has come, from 0 to 1.
+
+        Away from it, open fingers are worth a half and closed ones nothing; around it, their closing raises the value,
+        and 1 is an object that they hold.
+        """
+        if self.holds(thing, at):
+            return 1.0
+        opened = min(1.0, self.opening / self.gripper.width_max)
+        around = np.linalg.norm(thing.transform(at) - self.tcp.position) < _AROUND
+        return 1.0 - 0.5 * opened if around else 0.5 * opened
+
     def twist(self, velocity: Array, most: Array) -> list[float]:
         """Return the twist (6,) along the axes of the arm's base, with the hand kept upright.
+
+        A hand that something holds back is not driven farther into it.
 
         Args:
             velocity: Velocity of the tcp along x, y and z, m/s, and of its turn about z, rad/s (4,).
             most: Greatest of them (4,).
         """
-        lean = np.cross(self.tcp.matrix()[:3, 2], (0.0, 0.0, -1.0))[:2]  # what turns the tcp's z axis down again
+        state = self.seen.robots[self.robot.name]
+        down = (self._base @ state.tcp_set).matrix()[:3, 2]
+        lean = np.cross(down, (0.0, 0.0, -1.0))[:2]  # what turns the set-point's z axis down again
         turn = [*(UPRIGHT_GAIN * lean).clip(-most[3], most[3]), velocity[3]]
-        return [*(self._turn @ velocity[:3]).tolist(), *(self._turn @ turn).tolist()]
+        twist = np.concatenate([self._turn @ velocity[:3], self._turn @ turn])
+        if self._env.rig.lock_step:  # real arms lag, also where nothing is in their way
+            poses = (pose_array(pose).tolist() for pose in (state.tcp, state.tcp_set))
+            self._hold_back(twist, np.array(difference(*poses)))
+        numbers: list[float] = twist.tolist()
+        return numbers
+
+    def _hold_back(self, twist: Array, lead: Array) -> None:
+        """Slow a twist (6,) down, or turn it round, where the set-point is well ahead of the hand, by ``lead`` (6,)."""
+        for part, most in zip((slice(3), slice(3, 6)), _LEAD, strict=True):
+            off = float(np.linalg.norm(lead[part]))
+            if off > 0.5 * most:
+                ahead = lead[part] / off
+                fastest = (most - off) * self._env.settings.rate_hz
+                twist[part] -= max(0.0, float(twist[part] @ ahead) - fastest) * ahead
 
     def check_gripper(self, width: float) -> None:
         """Check that the arm has a gripper that opens far enough for an object. Raises NotSupported."""

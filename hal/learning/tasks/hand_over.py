@@ -26,8 +26,8 @@ class HandOver(TaskEnv):
     The bar lies near the middle of the work area, turned by up to 17 degrees either way, an end towards each arm.
     Success: the right hand holds the bar at its end, 8 cm over the table or higher, and the left hand is open.
 
-    Dense reward: -1, and a quarter each for the left hand near its end, the bar held, the right hand near its end while
-    the bar is held, and the bar held by the right hand alone.
+    Dense reward: -1, and a quarter each for the left hand near its end, the progress of its grasp or the bar held, the
+    right hand near its end while the bar is held, and the bar held by the right hand alone.
     """
 
     arms = ("left", "right")
@@ -61,7 +61,8 @@ class HandOver(TaskEnv):
         near, far = (
             closeness(hand.tcp.position, bar.transform(end)) for hand, end in zip(self.hands, ENDS, strict=True)
         )
-        return -1.0 + (max(near, float(right)) + (left or right) * (1.0 + far) + (right and not left)) / 4.0
+        grasp = max(self.hands[0].measure_grasp(bar, ENDS[0]), float(right))
+        return -1.0 + (max(near, float(right)) + grasp + (left or right) * far + (right and not left)) / 4.0
 
     def solve(self) -> Iterator[Action]:
         """Yield actions: the left hand lifts the bar, the right one grasps it, the left one opens."""

@@ -30,8 +30,8 @@ class PegInHole(TaskEnv):
     Both are anywhere in the work area, 12 cm apart or more, the board turned by up to 45 degrees either way. The hole
     is 4 mm wider than the peg on each side. Success: the peg is at rest in the hole, within 1 cm of its ground.
 
-    Dense reward: -1, and a third each for the hand near the peg, the peg held or in the hole, and the peg near its
-    place.
+    Dense reward: -1, and a third each for the hand near the peg, the progress of its grasp or the peg in the hole, and
+    the peg held near its place.
     """
 
     objects = (
@@ -71,8 +71,10 @@ class PegInHole(TaskEnv):
             return 0.0
         peg = self.poses["peg"]
         near = closeness(self.tcp.position, peg.transform((0.0, 0.0, GRASPED - LENGTH / 2)))
-        brought = (self.holds("peg") or self.is_inserted()) * (1.0 + closeness(self.measure_offset(), np.zeros(3)))
-        return -1.0 + (near + brought) / 3.0
+        inserted = self.is_inserted()
+        grasp = max(self.measure_grasp("peg"), float(inserted))
+        brought = (self.holds("peg") or inserted) * closeness(self.measure_offset(), np.zeros(3))
+        return -1.0 + (near + grasp + brought) / 3.0
 
     def solve(self) -> Iterator[Action]:
         """Yield actions: grasp the peg, lift it, carry it over the hole, down, open."""

@@ -21,7 +21,8 @@ class PickCube(TaskEnv):
     The cube stands anywhere in the work area, turned by up to 45 degrees either way; the goal is 8 to 12 cm over the
     table. Success: the cube's middle is within 2.5 cm of the goal, and the arm is at rest.
 
-    Dense reward: -1, and a third each for the hand near the cube, the cube held, and the cube held near the goal.
+    Dense reward: -1, and a third each for the hand near the cube, the progress of its grasp, and the cube held near the
+    goal.
     """
 
     objects = (cube_entry("cube", SIDE, (0.85, 0.2, 0.2, 1.0)), goal_entry("goal", NEAR))
@@ -41,8 +42,8 @@ class PickCube(TaskEnv):
         if self.success():
             return 0.0
         cube, goal = self.poses["cube"].position, self.poses["goal"].position
-        held = self.holds("cube")
-        return -1.0 + (closeness(self.tcp.position, cube) + held + held * closeness(cube, goal)) / 3.0
+        brought = self.holds("cube") * closeness(cube, goal)
+        return -1.0 + (closeness(self.tcp.position, cube) + self.measure_grasp("cube") + brought) / 3.0
 
     def solve(self) -> Iterator[Action]:
         """Yield actions: above the cube, down, close, to the goal."""

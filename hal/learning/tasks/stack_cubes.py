@@ -26,8 +26,8 @@ class StackCubes(TaskEnv):
     Both stand anywhere in the work area, 10 cm apart or more, turned by up to 45 degrees either way. Success: the
     middle of the red cube is above that of the green one, within 2 cm across and 5 mm of height, at rest, and not held.
 
-    Dense reward: -1, and a quarter each for the hand near the red cube, that cube held or stacked, that cube near its
-    place, and that cube stacked with open fingers.
+    Dense reward: -1, and a quarter each for the hand near the red cube, the progress of its grasp or that cube stacked,
+    that cube held near its place or stacked, and that cube stacked with open fingers.
     """
 
     objects = (cube_entry("red", SIDE, (0.85, 0.2, 0.2, 1.0)), cube_entry("green", SIDE, (0.2, 0.7, 0.3, 1.0)))
@@ -57,8 +57,9 @@ class StackCubes(TaskEnv):
             return 0.0
         stacked, held = self.is_stacked(), self.holds("red")
         near = closeness(self.tcp.position, self.poses["red"].position)
-        brought = (held or stacked) * (1.0 + closeness(self.measure_offset(), np.zeros(3)))
-        return -1.0 + (near + brought + stacked * (self.opening > SIDE + 0.005)) / 4.0
+        grasp = max(self.measure_grasp("red"), float(stacked))
+        brought = (held or stacked) * closeness(self.measure_offset(), np.zeros(3))
+        return -1.0 + (near + grasp + brought + stacked * (self.opening > SIDE + 0.005)) / 4.0
 
     def solve(self) -> Iterator[Action]:
         """Yield actions: grasp the red cube, carry it over the green one, down, open, up."""

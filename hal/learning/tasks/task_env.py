@@ -234,6 +234,10 @@ class TaskEnv(RigEnv):
         """Return whether the first arm's fingers press on something, and the object is where the fingers are."""
         return self.hands[0].holds(self.poses[name])
 
+    def measure_grasp(self, name: str) -> float:
+        """Return how far the first arm's grasp of an object has come, from 0 to 1; see :meth:`.Hand.measure_grasp`."""
+        return self.hands[0].measure_grasp(self.poses[name])
+
     def speed(self, name: str) -> float:
         """Return the speed of an object, m/s; of one that a camera sees, its mean of 10 steps."""
         if self._judge is None:

@@ -231,6 +231,34 @@ def test_a_hidden_object_is_named_and_pays_nothing_wherever_it_was_seen_last(mon
         env.close()
 
 
+def test_closing_around_the_cube_pays_at_once() -> None:
+    env = gymnasium.make("hal/PickCube-v0").unwrapped
+    try:
+        env.reset(seed=0, options={"poses": {"cube": hal.Pose([0.5, 0.0, 0.025])}})
+        for action in env.go((0.5, 0.0, 0.03), 0.0, -1.0):
+            env.step(action)
+        assert min(np.diff([env.step(action)[1] for action in env.wait(5, 1.0)])) > 0.005
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_a_policy_that_explores_around_the_cube_does_not_stop_the_arm(engine: str) -> None:
+    pytest.importorskip(engine, reason=f"pip install 'robot-hal[{engine}]'")
+    env = gymnasium.make("hal/PickCube-v0", engine=engine).unwrapped
+    random = np.random.default_rng(0)
+    try:
+        for seed in range(2):
+            env.reset(seed=seed)
+            for _ in range(80):
+                off = env.poses["cube"].position - env.tcp.position
+                towards = np.array([16.0 * off[0], 16.0 * off[1], -0.5, 0.0, 0.3])
+                *_, info = env.step((towards + 0.4 * random.normal(size=5)).clip(-1.0, 1.0))
+                assert "stopped" not in info
+    finally:
+        env.close()
+
+
 def test_a_script_ends_where_it_does_not_arrive() -> None:
     env = gymnasium.make("hal/PushCube-v0", rate_hz=5.0).unwrapped
     try:

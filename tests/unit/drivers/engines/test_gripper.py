@@ -177,6 +177,18 @@ class TestGrasping:
         assert bench.run(2.0, bench.lift)[-1].grasped
         assert bench.world.pose("cube")["position"][2] > 0.5
 
+    def test_new_commands_to_close_leave_a_grasp_as_it_is(self, bench: Bench) -> None:
+        """A policy and an analogue trigger send another width in every step."""
+        bench.put_cube()
+        readings = []
+        for k in range(24):
+            bench.hand.move(0.0 if k % 2 else 0.015, 0.1, 20.0)
+            readings += bench.run(0.05)
+        assert all(reading.grasped and not reading.moving for reading in readings[-120:])
+        bench.hand.move(0.06, 0.1, 20.0)
+        opened = bench.run(0.05)[-1]
+        assert (opened.moving, opened.grasped) == (True, False)
+
     @pytest.mark.parametrize("yaw", [-2.9, 0.6, 2.0])
     def test_oscillating_fingers_count_as_at_rest(self, bench: Bench, yaw: float) -> None:
         bench.put_duck(yaw)
