@@ -164,9 +164,8 @@ def _measure_lens(args: argparse.Namespace) -> int:
         size = f"width: {spec.capture_width}, height: {spec.capture_height}"
         output.check("intrinsics", f"{{{size}, fx: 1, fy: 1, cx: 0, cy: 0}}")
     views = calibration.LensViews(calibration.Detector(_board(args)))
-    raw = replace(
-        spec, width=spec.capture_width, height=spec.capture_height, options={**spec.options, "undistort": False}
-    )
+    options = {name: value for name, value in spec.options.items() if name != "undistort"}
+    raw = replace(spec, width=spec.capture_width, height=spec.capture_height, options=options)
     camera = Camera(registry.load(spec.driver, "camera")(raw, RealClock()), RealClock(), threaded=True)
     try:
         camera.open()
