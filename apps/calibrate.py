@@ -189,7 +189,10 @@ def _take_pictures(camera: Camera, views: LensViews, wanted: int) -> None:
     last = ""
     while len(views) < wanted:
         try:
-            corners = views.add(camera.read(timeout=5.0).color)
+            picture = camera.read(timeout=5.0).color
+            if picture is None:
+                raise CommandError(f"camera {camera.name} has no colour: add it to its streams", code="no_color")
+            corners = views.add(picture)
             text = f"view {len(views)} of {wanted}: {corners} corners"
         except NoView as reason:
             text = str(reason)

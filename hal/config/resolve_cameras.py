@@ -177,7 +177,7 @@ def resolve_streams(context: Context, key: str, config: CameraConfig, model: Cam
         size = f"{known.width}x{known.height}, not of {color.width}x{color.height}, which is captured"
         context.report(
             f"{key}.intrinsics",
-            f"are those of {size}: remove them and calibrate size, or capture the other",
+            f"are those of {size}: remove them, and calibrate this size",
             "conflict",
         )
     if len(context.problems.found) > before:
