@@ -164,9 +164,8 @@ def _measure_lens(args: argparse.Namespace) -> int:
         size = f"width: {spec.capture_width}, height: {spec.capture_height}"
         output.check("intrinsics", f"{{{size}, fx: 1, fy: 1, cx: 0, cy: 0}}")
     views = calibration.LensViews(calibration.Detector(_board(args)))
-    raw = replace(
-        spec, width=spec.capture_width, height=spec.capture_height, options={**spec.options, "undistort": False}
-    )
+    options = {name: value for name, value in spec.options.items() if name != "undistort"}
+    raw = replace(spec, width=spec.capture_width, height=spec.capture_height, options=options)
     camera = Camera(registry.load(spec.driver, "camera")(raw, RealClock()), RealClock(), threaded=True)
     try:
         camera.open()
@@ -190,7 +189,10 @@ def _take_pictures(camera: Camera, views: LensViews, wanted: int) -> None:
     last = ""
     while len(views) < wanted:
         try:
-            corners = views.add(camera.read(timeout=5.0).color)
+            picture = camera.read(timeout=5.0).color
+            if picture is None:
+                raise CommandError(f"camera {camera.name} has no colour: add it to its streams", code="no_color")
+            corners = views.add(picture)
             text = f"view {len(views)} of {wanted}: {corners} corners"
         except NoView as reason:
             text = str(reason)

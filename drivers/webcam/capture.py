@@ -251,15 +251,17 @@ def _set_controls(node: VideoNode, settings: V4l2Settings) -> Mapping[str, float
     """Set the controls of a rig's file, and switch off what would change them; return the values of all."""
     present = kernel.list_controls(node)
     ids = {control.title: id for id, control in present.items()}
-    wanted = {kernel.EXPOSURE: settings.exposure_s and 1e4 * settings.exposure_s, kernel.FOCUS: settings.focus}
+    wanted = dict[int, float]()
+    if settings.exposure_s is not None:
+        wanted[kernel.EXPOSURE] = 1e4 * settings.exposure_s
+    if settings.focus is not None:
+        wanted[kernel.FOCUS] = settings.focus
     listed = ", ".join(f"{c.title} ({c.minimum} to {c.maximum})" for c in present.values())
     for title, value in settings.options.items():
         if title not in ids:
             raise NotSupported(f"this camera has no control {title!r}; it has: {listed}", code="unknown_option")
         wanted[ids[title]] = value
     for id, value in wanted.items():
-        if value is None:
-            continue
         control = present.get(id)
         if control is None:
             what = "exposure" if id == kernel.EXPOSURE else "focus"
@@ -271,7 +273,7 @@ def _set_controls(node: VideoNode, settings: V4l2Settings) -> Mapping[str, float
         if automatic in present:
             node.call(kernel.SET_CONTROL, Control(id=automatic, value=manual))
         node.call(kernel.SET_CONTROL, Control(id=id, value=round(value)))
-    return {control.title: value for id, control in present.items() if (value := _get(node, id)) is not None}
+    return {control.title: now for id, control in present.items() if (now := _get(node, id)) is not None}
 
 
 def _get(node: VideoNode, id: int) -> float | None:

@@ -279,9 +279,8 @@ def _describe(folder: Path) -> FoundCamera:
     device = (folder / "device").resolve()
     usb = next((place for place in (device, *device.parents) if (place / "busnum").is_file()), None)
     port = (usb or device).name
-    return FoundCamera(
-        str(DEVICES / folder.name), _read(folder / "name") or "camera", usb and _read(usb / "serial"), port
-    )
+    serial = None if usb is None else _read(usb / "serial")
+    return FoundCamera(str(DEVICES / folder.name), _read(folder / "name") or "camera", serial, port)
 
 
 def _read(file: Path) -> str | None:

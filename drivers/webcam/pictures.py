@@ -31,7 +31,8 @@ class PictureDecoder:
 
     def __init__(self, name: str, width: int, height: int, matrix: str = "ITU601", full: bool = False) -> None:
         _, codec, pixels = FORMATS[name]
-        self._codec: Any = av.CodecContext.create(codec, "r")
+        create: Any = av.CodecContext.create
+        self._codec = create(codec, "r")
         self.sequential = name == "h264"
         """Whether a frame is only decoded after those before it."""
         self._size, self._bytes, self._how = (width, height), 0, {}

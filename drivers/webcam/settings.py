@@ -95,5 +95,5 @@ def _check_color(spec: CameraSpec, settings: Any) -> Iterator[tuple[str, str, st
     if set(spec.streams) != {"color"}:
         yield "streams", f"this camera has only color, not {', '.join(spec.streams)}", "unknown_stream"
     if settings is not None and settings.undistort and not any(spec.distortion):
-        text = "needs the camera's intrinsics with its distortion: hal calibrate intrinsics"
+        text = "needs the distortion in the camera's intrinsics: leave it out, and run hal calibrate intrinsics first"
         yield "real.undistort", text, "missing_key"

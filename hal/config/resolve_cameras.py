@@ -176,7 +176,9 @@ def resolve_streams(context: Context, key: str, config: CameraConfig, model: Cam
     if known is not None and color is not None and (known.width, known.height) != (color.width, color.height):
         size = f"{known.width}x{known.height}, not of {color.width}x{color.height}, which is captured"
         context.report(
-            f"{key}.intrinsics", f"are those of {size}: calibrate that size, or capture the other", "conflict"
+            f"{key}.intrinsics",
+            f"are those of {size}: remove them, and calibrate this size",
+            "conflict",
         )
     if len(context.problems.found) > before:
         return None

@@ -47,7 +47,8 @@ class FakeWebcam:
     """A USB camera, with its node in a made-up sysfs. Each frame is of one grey, which shows its number."""
 
     def __init__(self, root: Path, number: int, name: str = "HD Webcam", serial: str = "", port: str = "1-2") -> None:
-        self.folder, self.path, self.name = root / "class" / f"video{number}", f"/dev/video{number}", name
+        self.root, self.name = root, name
+        self.renumber(number)
         self.usb = root / "usb" / port
         (self.usb / f"{port}:1.0").mkdir(parents=True)
         (self.usb / "busnum").write_text("1\n")
@@ -60,6 +61,9 @@ class FakeWebcam:
         """Numbers of the frames that arrive damaged."""
         self.streaming: FakeNode | None = None
         self.plug()
+
+    def renumber(self, number: int) -> None:
+        self.folder, self.path = self.root / "class" / f"video{number}", f"/dev/video{number}"
 
     def plug(self) -> None:
         self.folder.mkdir(parents=True)
