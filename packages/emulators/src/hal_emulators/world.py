@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import itertools
 import math
 import os
 import select
@@ -74,11 +75,7 @@ class ArmOfWorld:
         if spec.gripper is not None and spec.gripper.joints:
             self._fingers = registry.load(world.spec.driver, "gripper")(spec.gripper, world)
             self._fingers.open()
-            body = world.body(spec.name)
-            self._sides = [
-                {link for link in body.links if joint in {above.name for above in body.urdf.above(link)}}
-                for joint in spec.gripper.joints
-            ]
+            self._sides = _find_sides(world.body(spec.name), spec.gripper.joints)
 
     def take(self, report: Mapping[str, Any]) -> None:
         """Take a report of the emulator. Raises ValueError if it is one of an arm with other joints."""
@@ -87,6 +84,11 @@ class ArmOfWorld:
         t, self.heard = report["t"], time.monotonic()
         self.reported = t
         self._reports.append((t, report["q"]))
+        self.take_fingers(report)
+
+    def take_fingers(self, report: Mapping[str, Any]) -> None:
+        """Take a report of the fingers, which may be that of a gripper with an emulator of its own."""
+        t = report["t"]
         if report["fingers"] is not None:
             width, self._force = report["fingers"]
             if self._width is not None and t > self._width[0]:
@@ -146,17 +148,28 @@ class ArmOfWorld:
         return now != before if now is None or before is None else abs(now - before) > 1e-6
 
     def _is_between(self) -> bool:
-        """Return whether both fingers touch one thing, from opposite sides."""
+        """Return whether two fingers touch one thing, from opposite sides."""
         touched: list[dict[str, list[Any]]] = [{} for _ in self._sides]
         for contact in self._world.contacts(self.name):
             for side, links in zip(touched, self._sides, strict=True):
                 if contact["link_a"] in links and contact["b"] != self.name:
                     side.setdefault(contact["b"], []).append(contact["normal"])
-        one, other = touched[0], touched[-1]
         return any(
             float(np.mean(one[thing], axis=0) @ np.mean(other[thing], axis=0)) < _OPPOSITE
+            for one, other in itertools.combinations(touched, 2)
             for thing in one.keys() & other
         )
+
+
+def _find_sides(body: Any, joints: Sequence[str]) -> list[set[str]]:
+    """Return the links that each joint of a gripper carries, joints with a mimic included."""
+    own = {
+        name for name, joint in body.urdf.joints.items() if name in joints or (joint.mimic and joint.mimic.of in joints)
+    }
+    first = {
+        link: next((joint.name for joint in body.urdf.above(link) if joint.name in own), None) for link in body.links
+    }
+    return [{link for link, joint in first.items() if joint == name} for name in sorted(own)]
 
 
 class WorldServer:
@@ -181,6 +194,8 @@ class WorldServer:
         self._clients: dict[int, Connection] = {}
         self._roles: dict[int, str] = {}
         self._arms_of: dict[int, ArmOfWorld] = {}
+        self._fingers_of: dict[int, ArmOfWorld] = {}
+        """Arms whose gripper has an emulator of its own, by that one's connection."""
         self._t = time.monotonic()
         """Time of the step that was made last, s."""
         self._build()
@@ -234,7 +249,7 @@ class WorldServer:
             arm.prepare_step(t, dt)
         self.world.step()
         changed = {name for name, arm in self.arms.items() if arm.finish_step(t)}
-        for descriptor, arm in self._arms_of.items():
+        for descriptor, arm in (*self._arms_of.items(), *self._fingers_of.items()):
             if arm.name in changed:
                 self._send(descriptor, {"object": arm.object_width})
         watching = [descriptor for descriptor, role in self._roles.items() if role == "poses"]
@@ -265,6 +280,8 @@ class WorldServer:
                     self._greet(descriptor, message)
                 elif descriptor in self._arms_of:
                     self._arms_of[descriptor].take(message)
+                elif descriptor in self._fingers_of:
+                    self._fingers_of[descriptor].take_fingers(message)
                 else:
                     client.send(self._answer(message))
         except ConnectionLost:
@@ -278,6 +295,7 @@ class WorldServer:
         self._poller.unregister(client.sock)
         self._roles.pop(descriptor, None)
         self._arms_of.pop(descriptor, None)
+        self._fingers_of.pop(descriptor, None)
         client.close()
 
     def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -300,14 +318,14 @@ class WorldServer:
 
     def _admit(self, descriptor: int, message: Mapping[str, Any]) -> dict[str, Any]:
         role = message["role"]
-        if role == "arm":
+        if role in ("arm", "fingers"):
             name = message["name"]
             if name not in self.arms:
                 names = ", ".join(self.arms)
                 raise CommandError(
                     f"the world of the emulators has no arm {name!r}, but {names}: start each with the same rig"
                 )
-            arm = self._arms_of[descriptor] = self.arms[name]
+            arm = (self._arms_of if role == "arm" else self._fingers_of)[descriptor] = self.arms[name]
             return {"object": arm.object_width}
         if role == "poses":
             return self._state()
@@ -323,9 +341,10 @@ class WorldServer:
         before = self.world
         self._build()
         before.close()
-        for descriptor, arm in self._arms_of.items():
-            self._arms_of[descriptor] = self.arms[arm.name]
-            self._send(descriptor, {"object": None})
+        for place in (self._arms_of, self._fingers_of):
+            for descriptor, arm in place.items():
+                place[descriptor] = self.arms[arm.name]
+                self._send(descriptor, {"object": None})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

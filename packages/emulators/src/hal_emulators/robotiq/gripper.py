@@ -64,6 +64,15 @@ class EmulatedGripper:
             if before is not None and self.position == before:
                 self.position = self.object_count  # fingers on an object that is measured anew
 
+    def meet(self, width: float | None) -> None:
+        """Take the width, m, at which an object in a simulated world stops the fingers; None for no object.
+
+        The world is a few ms late, so the fingers may be too far.
+        """
+        self.put(width)
+        if self.object_count is not None and self.position > self.object_count:
+            self.position = self.object_count
+
     def take(self, request: Request) -> None:
         """Take what was written to the registers."""
         before, self.request = self.request, request

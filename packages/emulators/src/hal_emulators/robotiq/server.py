@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from hal.config.loader import load
 from hal.specs import GripperSpec
+from hal_emulators.shared_world import ArmInWorld
 
 from .gripper import EmulatedGripper
 from .ports import Port, SerialPort, TextPort
@@ -53,6 +54,8 @@ class RobotiqEmulator:
             one.spec.arm: (SerialPort if one.settings.port is not None else TextPort)(one, seed) for one in made
         }
         self.paced = paced
+        self.worlds: dict[str, ArmInWorld] = {}
+        """Places in the simulated world that the emulators of the rig share, by the name of the arm."""
         self.lock = threading.Lock()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="robotiq-emulator", daemon=True)
@@ -67,8 +70,14 @@ class RobotiqEmulator:
         while left > 1e-9:
             dt = min(left, _STEP)
             left -= dt
-            for port in self.ports.values():
+            for name, port in self.ports.items():
+                world = self.worlds.get(name)
+                if world is not None:
+                    port.gripper.meet(world.object_width)
                 port.gripper.advance(dt)
+                if world is not None:
+                    world.fingers = (port.gripper.width, port.gripper.force)
+                    world.exchange(dt, ())
 
     def _serve(self) -> None:
         before = monotonic()
