@@ -48,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 stack.enter_context(run_world(options.config, options.set))
                 for robot in load(options.config, sim=False, overrides=options.set).resolve().robots:
                     if robot.name in emulator.ports:
+                        emulator.ports[robot.name].gripper.in_world = True
                         emulator.worlds[robot.name] = ArmInWorld(address_of(robot), robot.name, role="fingers")
             stack.enter_context(emulator)
             control = CommandPort(emulator.execute, options.port)

@@ -30,6 +30,8 @@ class EmulatedGripper:
         self.object_count: float | None = None
         self.blocked = False
         """Whether something outside holds the fingers, so that an activation fails."""
+        self.in_world = False
+        """Whether it meets the objects of a simulated world."""
         self.powered = True
         self.on_at = 0.0
         """When the power comes back, s on the monotonic clock."""

@@ -112,8 +112,8 @@ class RobotiqEmulator:
         try:
             with self.lock:
                 return command.run(port, words[1:]) or {}
-        except (ValueError, IndexError):
-            raise ValueError(f"usage: {command.usage}") from None
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"{error}; usage: {command.usage}") from None
 
     def start(self) -> None:
         """Offer all lines. Raises OSError."""
@@ -155,6 +155,12 @@ def _set(name: str, read: Callable[[str], Any]) -> Callable[[Port, list[str]], N
     return lambda port, words: setattr(port, name, read(words[0]))
 
 
+def _put(port: Port, words: list[str]) -> None:
+    if port.gripper.in_world:
+        raise ValueError("the fingers meet the objects of the simulated world: use rig.world, or --no-world")
+    port.gripper.put(None if words[0] == "none" else float(words[0]))
+
+
 def _lose(port: Port, words: list[str]) -> None:
     if words[0] == "next":
         port.lose_next = int(words[1])
@@ -183,7 +189,7 @@ COMMANDS = {
     "object": _Command(
         "object M|none",
         "put an object of this width between the fingers",
-        lambda port, words: port.gripper.put(None if words[0] == "none" else float(words[0])),
+        _put,
     ),
     "fault": _Command(
         "fault CODE", "raise a fault, hex: 8 to F; 0 ends it", lambda p, w: p.gripper.fail(int(w[0], 16))
