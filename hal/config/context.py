@@ -146,10 +146,11 @@ class Context:
             if mount is not None:
                 self.report(f"{key}.gripper.mount", "needs a gripper that model names", "missing_key")
             return data
-        found = find_file(chosen or own, "gripper model", self.base if chosen else file.parent, "robots", "grippers")
+        base = self.base if chosen else file.parent
+        found = find_file(chosen or str(own), "gripper model", base, "robots", "grippers")
         if isinstance(found, str):
-            where = (self.source, f"{key}.gripper.model") if chosen else (file, "gripper")
-            self.problems.add(*where, found, "unknown_model")
+            at = f"{key}.gripper.model" if chosen else "gripper"
+            self.problems.add(self.source if chosen else file, at, found, "unknown_model")
             return None
         before = len(self.problems.found)
         given = read_yaml(found, self.problems)

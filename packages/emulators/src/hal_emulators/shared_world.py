@@ -39,15 +39,15 @@ class ArmInWorld:
         object_width: Width at which an object stops the fingers, m; None if nothing is between them.
     """
 
-    def __init__(self, address: str, name: str) -> None:
-        """Enter the world.
+    def __init__(self, address: str, name: str, role: str = "arm") -> None:
+        """Enter the world; with the role ``fingers`` as the gripper of that arm, which has an emulator of its own.
 
         Raises:
             ConnectionLost: There is no such world.
             ValueError: It has no arm of this name; lists those that it has.
         """
         self.fingers: tuple[float, float, float] | None = None
-        connection, answer = Connection.connect(address, _START, role="arm", name=name)
+        connection, answer = Connection.connect(address, _START, role=role, name=name)
         connection.sock.setblocking(False)
         self._connection: Connection | None = connection
         self.object_width: float | None = answer["object"]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import itertools
 import math
 import os
 import select
@@ -74,11 +75,7 @@ class ArmOfWorld:
         if spec.gripper is not None and spec.gripper.joints:
             self._fingers = registry.load(world.spec.driver, "gripper")(spec.gripper, world)
             self._fingers.open()
-            body = world.body(spec.name)
-            self._sides = [
-                {link for link in body.links if joint in {above.name for above in body.urdf.above(link)}}
-                for joint in spec.gripper.joints
-            ]
+            self._sides = _find_sides(world.body(spec.name), spec.gripper.joints)
 
     def take(self, report: Mapping[str, Any]) -> None:
         """Take a report of the emulator. Raises ValueError if it is one of an arm with other joints."""
@@ -87,6 +84,10 @@ class ArmOfWorld:
         t, self.heard = report["t"], time.monotonic()
         self.reported = t
         self._reports.append((t, report["q"]))
+        self.take_fingers(report)
+
+    def take_fingers(self, report: Mapping[str, Any]) -> None:
+        """Take a report of the fingers, which may be that of a gripper with an emulator of its own."""
         if report["fingers"] is not None:
             self._reports_of_fingers.append(report["fingers"])
 
@@ -148,17 +149,28 @@ class ArmOfWorld:
             self.object_width = None
 
     def _is_between(self) -> bool:
-        """Return whether both fingers touch one thing, from opposite sides."""
+        """Return whether two fingers touch one thing, from opposite sides."""
         touched: list[dict[str, list[Any]]] = [{} for _ in self._sides]
         for contact in self._world.contacts(self.name):
             for side, links in zip(touched, self._sides, strict=True):
                 if contact["link_a"] in links and contact["b"] != self.name:
                     side.setdefault(contact["b"], []).append(contact["normal"])
-        one, other = touched[0], touched[-1]
         return any(
             float(np.mean(one[thing], axis=0) @ np.mean(other[thing], axis=0)) < _OPPOSITE
+            for one, other in itertools.combinations(touched, 2)
             for thing in one.keys() & other
         )
+
+
+def _find_sides(body: Any, joints: Sequence[str]) -> list[set[str]]:
+    """Return the links that each joint of a gripper carries, joints with a mimic included."""
+    own = {
+        name for name, joint in body.urdf.joints.items() if name in joints or (joint.mimic and joint.mimic.of in joints)
+    }
+    first = {
+        link: next((joint.name for joint in body.urdf.above(link) if joint.name in own), None) for link in body.links
+    }
+    return [{link for link, joint in first.items() if joint == name} for name in sorted(own)]
 
 
 class WorldServer:
@@ -185,6 +197,8 @@ class WorldServer:
         self._arms_of: dict[int, ArmOfWorld] = {}
         self._requests: deque[tuple[float, int, int, str, dict[str, Any]]] = deque()
         """Time of the world for which a request is, s, the client that waits for the answer, and the request."""
+        self._fingers_of: dict[int, ArmOfWorld] = {}
+        """Arms whose gripper has an emulator of its own, by that one's connection."""
         self._t = time.monotonic()
         """Time of the step that was made last, s."""
         self._build()
@@ -240,7 +254,7 @@ class WorldServer:
         self.world.step()
         for arm in self.arms.values():
             arm.finish_step(t)
-        for descriptor, arm in self._arms_of.items():
+        for descriptor, arm in (*self._arms_of.items(), *self._fingers_of.items()):
             self._send(descriptor, {"object": arm.object_width, "t": t})
         watching = [descriptor for descriptor, role in self._roles.items() if role == "poses"]
         if watching:
@@ -270,6 +284,8 @@ class WorldServer:
                     self._greet(descriptor, message)
                 elif descriptor in self._arms_of:
                     self._arms_of[descriptor].take(message)
+                elif descriptor in self._fingers_of:
+                    self._fingers_of[descriptor].take_fingers(message)
                 else:
                     request = message["id"], message["method"], message["params"]
                     self._requests.append((self._reported(time.monotonic()), descriptor, *request))
@@ -285,6 +301,7 @@ class WorldServer:
         if self._roles.pop(descriptor, None) == "requests":
             self._requests.clear()
         self._arms_of.pop(descriptor, None)
+        self._fingers_of.pop(descriptor, None)
         client.close()
 
     def _answer_due(self, t: float) -> None:
@@ -313,14 +330,14 @@ class WorldServer:
 
     def _admit(self, descriptor: int, message: Mapping[str, Any]) -> dict[str, Any]:
         role = message["role"]
-        if role == "arm":
+        if role in ("arm", "fingers"):
             name = message["name"]
             if name not in self.arms:
                 names = ", ".join(self.arms)
                 raise CommandError(
                     f"the world of the emulators has no arm {name!r}, but {names}: start each with the same rig"
                 )
-            arm = self._arms_of[descriptor] = self.arms[name]
+            arm = (self._arms_of if role == "arm" else self._fingers_of)[descriptor] = self.arms[name]
             return {"object": arm.object_width, "t": self._t}
         if role == "poses":
             return self._state()
@@ -336,8 +353,9 @@ class WorldServer:
         before = self.world
         self._build()
         before.close()
-        for descriptor, arm in self._arms_of.items():
-            self._arms_of[descriptor] = self.arms[arm.name]
+        for place in (self._arms_of, self._fingers_of):
+            for descriptor, arm in place.items():
+                place[descriptor] = self.arms[arm.name]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -30,6 +30,8 @@ class EmulatedGripper:
         self.object_count: float | None = None
         self.blocked = False
         """Whether something outside holds the fingers, so that an activation fails."""
+        self.in_world = False
+        """Whether it meets the objects of a simulated world."""
         self.powered = True
         self.on_at = 0.0
         """When the power comes back, s on the monotonic clock."""
@@ -63,6 +65,15 @@ class EmulatedGripper:
             self.object_count = self.closed - self.spec.travel_at(width) * (self.closed - self.opened)
             if before is not None and self.position == before:
                 self.position = self.object_count  # fingers on an object that is measured anew
+
+    def meet(self, width: float | None) -> None:
+        """Take the width, m, at which an object in a simulated world stops the fingers; None for no object.
+
+        The world is a few ms late, so the fingers may be too far.
+        """
+        self.put(width)
+        if self.object_count is not None and self.position > self.object_count:
+            self.position = self.object_count
 
     def take(self, request: Request) -> None:
         """Take what was written to the registers."""

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from hal.config.loader import load
 from hal.specs import GripperSpec
+from hal_emulators.shared_world import ArmInWorld
 
 from .gripper import EmulatedGripper
 from .ports import Port, SerialPort, TextPort
@@ -53,6 +54,8 @@ class RobotiqEmulator:
             one.spec.arm: (SerialPort if one.settings.port is not None else TextPort)(one, seed) for one in made
         }
         self.paced = paced
+        self.worlds: dict[str, ArmInWorld] = {}
+        """Places in the simulated world that the emulators of the rig share, by the name of the arm."""
         self.lock = threading.Lock()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="robotiq-emulator", daemon=True)
@@ -67,8 +70,14 @@ class RobotiqEmulator:
         while left > 1e-9:
             dt = min(left, _STEP)
             left -= dt
-            for port in self.ports.values():
+            for name, port in self.ports.items():
+                world = self.worlds.get(name)
+                if world is not None:
+                    port.gripper.meet(world.object_width)
                 port.gripper.advance(dt)
+                if world is not None:
+                    world.fingers = (world.now, port.gripper.width, port.gripper.force)
+                    world.exchange(dt, ())
 
     def _serve(self) -> None:
         before = monotonic()
@@ -103,8 +112,8 @@ class RobotiqEmulator:
         try:
             with self.lock:
                 return command.run(port, words[1:]) or {}
-        except (ValueError, IndexError):
-            raise ValueError(f"usage: {command.usage}") from None
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"{error}; usage: {command.usage}") from None
 
     def start(self) -> None:
         """Offer all lines. Raises OSError."""
@@ -146,6 +155,12 @@ def _set(name: str, read: Callable[[str], Any]) -> Callable[[Port, list[str]], N
     return lambda port, words: setattr(port, name, read(words[0]))
 
 
+def _put(port: Port, words: list[str]) -> None:
+    if port.gripper.in_world:
+        raise ValueError("the fingers meet the objects of the simulated world: use rig.world, or --no-world")
+    port.gripper.put(None if words[0] == "none" else float(words[0]))
+
+
 def _lose(port: Port, words: list[str]) -> None:
     if words[0] == "next":
         port.lose_next = int(words[1])
@@ -174,7 +189,7 @@ COMMANDS = {
     "object": _Command(
         "object M|none",
         "put an object of this width between the fingers",
-        lambda port, words: port.gripper.put(None if words[0] == "none" else float(words[0])),
+        _put,
     ),
     "fault": _Command(
         "fault CODE", "raise a fault, hex: 8 to F; 0 ends it", lambda p, w: p.gripper.fail(int(w[0], 16))
