@@ -9,9 +9,9 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arguments import freeze
 from hal.driver import CameraInfo
 from hal.errors import DriverMissing
-from hal.geometry import freeze
 from hal.images import Cropping
 from hal.specs import CameraSpec
 

@@ -16,8 +16,11 @@ import pytest
 import yaml
 
 import hal
+from hal.config.data_files import find_data
+from hal.skills import grasp, grasp_pose, locate_by_truth
 
 from .franka_kit import free_host
+from .ur_kit import PORTS
 
 START = 60.0
 
@@ -52,18 +55,16 @@ class Lab:
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """A rig of an FR3 and a YAM at addresses of this test's own."""
+    """A UR5e with a Robotiq 2F-85 and a cube, and a YAM behind it, at addresses of this test's own."""
     channel = f"239.74.{128 + os.getpid() // 250 % 100}.{1 + os.getpid() % 250}"
-    rig = {
-        "sim": False,
-        "robots": {
-            "left": {"model": "fr3", "base": {"position": [0, 0.5, 0]}, "real": {"host": free_host()}},
-            "right": {
-                "model": "yam",
-                "base": {"position": [0, -0.5, 0]},
-                "real": {"interface": "udp_multicast", "channel": channel},
-            },
-        },
+    path = find_data("config", "ur5e_robotiq.yaml")
+    text = path.read_text(encoding="utf-8").replace("127.0.0.2", free_host((*PORTS, 63352)))
+    rig = yaml.safe_load(text)
+    rig["cameras"]["scene"]["capture"]["rate_hz"] = 6
+    rig["robots"]["right"] = {
+        "model": "yam",
+        "base": {"position": [-0.55, 1.5, 0.6]},
+        "real": {"interface": "udp_multicast", "channel": channel},
     }
     path = tmp_path / "lab.yaml"
     path.write_text(yaml.safe_dump(rig), encoding="utf-8")
@@ -75,33 +76,50 @@ def lab(config: Path) -> Iterator[Lab]:
     """The laboratory, ready."""
     lab = Lab(config)
     ready = set()
-    while ready != {"left", "can"}:
+    while ready != {"arm", "robotiq", "can"}:
         ready.add(lab.wait_line(lambda line: "ready:" in line).partition(":")[0])
     yield lab
     lab.process.kill()
     lab.process.wait(10.0)
 
 
-def test_a_rig_is_driven_as_in_simulation_and_stopped_by_a_fault_that_was_typed(lab: Lab, config: Path) -> None:
+def grasp_cube(config: Path, sim: bool) -> tuple[bool, float, float]:
+    """Grasp the cube; return whether it is held, the width of the fingers and how far it is lifted, m."""
+    with hal.open(config, sim=sim, pad="none", clock="lock_step" if sim else "real_time") as rig:
+        arm = rig.robots["arm"]
+        assert arm.gripper is not None
+        if not sim:
+            arm.gripper.home()
+        arm.move_to(arm.home, speed=0.3, unattended=True)
+        found = locate_by_truth(rig, arm, "cube")
+        assert found is not None
+        low = rig.world.pose("cube").position[2]
+        done = grasp(arm, grasp_pose(found, arm.gripper), unattended=True)
+        rig.robots["right"].move_to(rig.robots["right"].home, unattended=True)
+        return bool(done), done.width, rig.world.pose("cube").position[2] - low
+
+
+@pytest.mark.alone
+def test_one_program_grasps_in_simulation_and_in_the_laboratory_and_a_typed_fault_stops_it(
+    lab: Lab, config: Path
+) -> None:
     for sim in (True, False):
-        with hal.open(config, sim=sim) as rig:
-            for name in ("left", "right"):
-                robot = rig.robots[name]
-                goal = [q + 0.05 for q in robot.spec.home]
-                robot.move_to(goal, unattended=True)
-                assert robot.state().q == pytest.approx(goal, abs=0.01)
-            if not sim:
-                lab.type("left user-stop on")
-                with pytest.raises(hal.HalError, match="user stop"):
-                    rig.robots["left"].move_to(rig.robots["left"].spec.home, unattended=True)
+        held, width, lifted = grasp_cube(config, sim)
+        assert held
+        assert width == pytest.approx(0.03, abs=2e-3)
+        assert lifted == pytest.approx(0.1, abs=5e-3)
     lab.type("middle help")
-    assert "left, can" in lab.wait_line(lambda line: "begin with the name" in line)
+    assert "can, arm, robotiq" in lab.wait_line(lambda line: "begin with the name" in line)
+    with hal.open(config, sim=False, pad="none") as rig:
+        lab.type("arm protective")
+        with pytest.raises(hal.HalError, match="protective stop"):
+            rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_no_emulator_outlives_it(lab: Lab, config: Path, number: int) -> None:
     children = Path(f"/proc/{lab.process.pid}/task/{lab.process.pid}/children").read_text().split()
-    assert len(children) == 2
+    assert len(children) == 3
     for _ in range(3):  # as impatient people do
         lab.process.send_signal(number)
     lab.process.wait(15.0)

@@ -66,15 +66,14 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
         return Emulator("can", ["can", *words])
     if driver == "robotiq":
         return Emulator("robotiq", ["robotiq", *words])
-    host = ["--host", str(arm.options.get("host"))]
+    if arm.driver != driver or driver not in ("franka", "ur"):
+        return None
+    options = ["--host", str(arm.options["host"]), *(words if in_world else [])]
     if driver == "ur":
-        return Emulator(arm.name, ["ur", "--robot", arm.model, *host])
-    if driver == "franka" and arm.driver == driver:
-        bare = arm.gripper is None or arm.gripper.driver != driver
-        hand = ["--end-effector", "none", "--no-hand"] if bare else []
-        world = words if in_world else []
-        return Emulator(arm.name, ["franka", "--robot", _FRANKA[arm.options["arm"]], *host, *hand, *world])
-    return None
+        return Emulator(arm.name, ["ur", "--robot", arm.model, *options])
+    bare = arm.gripper is None or arm.gripper.driver != driver
+    hand = ["--end-effector", "none", "--no-hand"] if bare else []
+    return Emulator(arm.name, ["franka", "--robot", _FRANKA[arm.options["arm"]], *hand, *options])
 
 
 def run_lab(config: str, overrides: Sequence[str] = ()) -> int:

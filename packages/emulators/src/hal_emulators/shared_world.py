@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from hal.config.loader import load
-from hal.drivers.scene.shared import Connection
+from hal.drivers.scene.shared import Connection, address_of
 from hal.errors import ConnectionLost
 
 PRIORITY = 40
@@ -136,3 +136,23 @@ def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
                 process.wait(_END)
             except subprocess.TimeoutExpired:
                 process.kill()
+
+
+def enter_world(
+    stack: contextlib.ExitStack, config: str, overrides: Sequence[str], driver: str, host: str
+) -> ArmInWorld:
+    """Return the place of an arm in the simulated world of its rig, which is run until the stack is closed.
+
+    Raises:
+        ConfigError: The rig is not valid.
+        ValueError: It has no arm of this driver at this address, or its world does not start.
+    """
+    rig = load(config, sim=False, overrides=overrides).resolve()
+    arm = next((arm for arm in rig.robots if arm.driver == driver and arm.options.get("host") == host), None)
+    if arm is None:
+        raise ValueError(f"{config} has no {driver} at {host}: change --host, or --set robots.NAME.real.host")
+    stack.enter_context(run_world(config, overrides))
+    raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
+    world = ArmInWorld(address_of(arm), arm.name)
+    stack.callback(world.close)
+    return world

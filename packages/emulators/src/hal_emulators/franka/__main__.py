@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hal.config.data_files import find_data
-from hal.config.loader import load
 from hal.drivers.franka.limits import LIMITS
-from hal.drivers.scene.shared import address_of
 from hal.errors import HalError
 from hal_emulators.control import CONTROL_PORT
-from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority, run_world
+from hal_emulators.shared_world import ArmInWorld, enter_world
 
 from .arm import EmulatedArm, RobotFiles
 from .console import CommandConsole, Executor
@@ -155,17 +153,7 @@ def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | 
         return None
     if options.unpaced:
         raise ValueError("--config does not go with --unpaced: an app in simulated time has a world of its own")
-    rig = load(options.config, sim=False, overrides=options.set).resolve()
-    arm = next((arm for arm in rig.robots if arm.driver == "franka" and arm.options.get("host") == options.host), None)
-    if arm is None:
-        raise ValueError(
-            f"{options.config} has no Franka at {options.host}: change --host, or --set robots.NAME.real.host"
-        )
-    stack.enter_context(run_world(options.config, options.set))
-    raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
-    world = ArmInWorld(address_of(arm), arm.name)
-    stack.callback(world.close)
-    return world
+    return enter_world(stack, options.config, options.set, "franka", options.host)
 
 
 def _address(text: str) -> str:

@@ -13,7 +13,7 @@ from hal.config.loader import load
 from hal.drivers.scene.shared import address_of
 from hal.errors import HalError
 from hal_emulators.control import CommandPort, serve_prompt
-from hal_emulators.shared_world import ArmInWorld, has_world, run_world
+from hal_emulators.shared_world import PRIORITY, ArmInWorld, has_world, raise_priority, run_world
 
 from .server import RobotiqEmulator, find_grippers, help_text
 
@@ -50,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     if robot.name in emulator.ports:
                         emulator.ports[robot.name].gripper.in_world = True
                         emulator.worlds[robot.name] = ArmInWorld(address_of(robot), robot.name, role="fingers")
+                raise_priority(PRIORITY)
             stack.enter_context(emulator)
             control = CommandPort(emulator.execute, options.port)
             places = ", ".join(f"{arm} at {port.gripper.settings.place}" for arm, port in emulator.ports.items())

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import ipaddress
 import signal
 import sys
 from collections.abc import Sequence
 
+from hal.errors import HalError
 from hal_emulators.control import CONTROL_PORT
+from hal_emulators.shared_world import enter_world
 
 from .controller import Controller
 from .motion import ROBOTS
@@ -40,27 +43,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="M",
         help="tcp of the installation: m, rotation vector",
     )
+    add(
+        "--config",
+        metavar="RIG",
+        help="put the arm into the simulated world of this rig, whose objects its gripper meets (a name, or a path)",
+    )
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
     add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
     options = parser.parse_args(arguments)
     try:
-        server = UrServer(
-            options.host, Controller(options.robot, options.q, options.payload, options.tcp), options.seed
-        )
-    except OSError as error:
-        print(f"error: {options.host}: {error.strerror}", file=sys.stderr)
+        with contextlib.ExitStack() as stack:
+            _serve(options, stack)
+    except (HalError, OSError, ValueError) as error:
+        text = f"{options.host}: {error.strerror}" if isinstance(error, OSError) and error.strerror else error
+        print(f"error: {text}", file=sys.stderr)
         return 1
+    return 0
+
+
+def _serve(options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
+    controller = Controller(options.robot, options.q, options.payload, options.tcp)
+    server = UrServer(options.host, controller, options.seed)
+    stack.callback(server.close)
+    if options.config is not None:
+        server.world = enter_world(stack, options.config, options.set, "ur", options.host)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: server.stop())
     gc.freeze()
-    rate = server.controller.rate
     print(
-        f"ready: {options.robot} at {options.host}, RTDE {RTDE} ({rate} Hz), dashboard {DASHBOARD}, "
+        f"ready: {options.robot} at {options.host}, RTDE {RTDE} ({controller.rate} Hz), dashboard {DASHBOARD}, "
         f"control {options.host}:{CONTROL_PORT}",
         flush=True,
     )
     server.run()
-    server.close()
-    return 0
 
 
 def _loopback(text: str) -> str:

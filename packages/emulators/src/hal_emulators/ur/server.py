@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hal_emulators.control import CONTROL_PORT
+from hal_emulators.shared_world import ArmInWorld
 
 from .controller import POWER_OFF, RUNNING, Controller
 
@@ -127,6 +128,8 @@ class UrServer:
 
     def __init__(self, host: str, controller: Controller, seed: int = 0) -> None:
         self.host, self.controller = host, controller
+        self.world: ArmInWorld | None = None
+        """The simulated world that the arm is in."""
         self._home = list(controller.motion.q)
         self._random = random.Random(seed)
         self._selector = selectors.DefaultSelector()
@@ -159,6 +162,8 @@ class UrServer:
             if time.monotonic() - due > 0.1:  # a computer that slept: time is not made up for
                 due = time.monotonic()
             self.controller.step()
+            if self.world is not None:
+                self.world.exchange(self.controller.dt, self.controller.motion.q)
             self._publish()
 
     def stop(self) -> None:
