@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, lambda number, _: ends.append(number))
     try:
         with contextlib.ExitStack() as stack:
-            emulator = RobotiqEmulator(find_grippers(options.config, options.set), options.seed)
+            emulator = RobotiqEmulator(find_grippers(options.config, options.set), options.seed, realtime=True)
             if not options.no_world and has_world(options.config, options.set):
                 stack.enter_context(run_world(options.config, options.set))
                 for robot in load(options.config, sim=False, overrides=options.set).resolve().robots:

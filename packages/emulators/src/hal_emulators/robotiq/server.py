@@ -6,6 +6,7 @@ with RobotiqEmulator("fr3_robotiq") as emulator:
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
@@ -29,6 +30,8 @@ _STEP = 0.002
 _LONGEST_GAP = 0.25
 """Time that the fingers make up for after the machine had no time for them, s."""
 _FOREVER = 1e9
+_PRIORITY = 40
+"""Of the thread of a program among SCHED_FIFO threads: a busy computer must not look like a silent gripper."""
 
 
 def find_grippers(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[GripperSpec]:
@@ -48,12 +51,14 @@ class RobotiqEmulator:
         paced: Whether the fingers move in real time; otherwise only by :meth:`advance`.
     """
 
-    def __init__(self, grippers: Iterable[GripperSpec], seed: int = 0, paced: bool = True) -> None:
+    def __init__(
+        self, grippers: Iterable[GripperSpec], seed: int = 0, paced: bool = True, realtime: bool = False
+    ) -> None:
         made = [EmulatedGripper(spec) for spec in grippers]
         self.ports: dict[str, Port] = {
             one.spec.arm: (SerialPort if one.settings.port is not None else TextPort)(one, seed) for one in made
         }
-        self.paced = paced
+        self.paced, self._realtime = paced, realtime
         self.worlds: dict[str, ArmInWorld] = {}
         """Places in the simulated world that the emulators of the rig share, by the name of the arm."""
         self.lock = threading.Lock()
@@ -80,6 +85,9 @@ class RobotiqEmulator:
                     world.exchange(dt, ())
 
     def _serve(self) -> None:
+        if self._realtime:
+            with contextlib.suppress(AttributeError, OSError):  # Linux only, and only where it is allowed
+                os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
         before = monotonic()
         while not self._end.is_set():
             with self.lock:
