@@ -434,9 +434,8 @@ class _Target:
         self._all = context.framebuffer(layers, depth)
         self._open: Any = self._all.color_mask
         one, none = (True,) * 4, (False,) * 4
-        self._masks = dict.fromkeys(streams, one)
-        if len(streams) > 1:
-            self._masks = {name: [one if other == name else none for other in streams] for name in streams}
+        masks: Any = [[one if other == name else none for other in streams] for name in streams]
+        self._masks = dict(zip(streams, masks if len(streams) > 1 else [one], strict=True))
         self._lit = {
             name: context.framebuffer([layer], depth)
             for name, layer in zip(streams, layers, strict=True)

@@ -312,7 +312,7 @@ class DrawnPart:
         faces = place[mesh.faces]
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
         if not len(faces):  # a rod, or what is so flat that it has no cell of its own
-            points, faces = mesh.positions, mesh.faces.astype(np.int64)
+            points, faces = mesh.positions.astype(float), mesh.faces.astype(np.int64)
         first = faces.argmin(axis=1)[:, None]
         faces = np.unique(np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0)
         return points.astype(np.float32), faces if mesh.closed else np.concatenate([faces, faces[:, ::-1]])
