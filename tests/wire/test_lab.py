@@ -109,7 +109,7 @@ def test_one_program_grasps_in_simulation_and_in_the_laboratory_and_a_typed_faul
         assert width == pytest.approx(0.03, abs=2e-3)
         assert lifted == pytest.approx(0.1, abs=5e-3)
     lab.type("middle help")
-    assert "can, arm, robotiq" in lab.wait_line(lambda line: "begin with the name" in line)
+    assert "arm, robotiq, can" in lab.wait_line(lambda line: "begin with the name" in line)
     with hal.open(config, sim=False, pad="none") as rig:
         lab.type("arm protective")
         with pytest.raises(hal.HalError, match="protective stop"):
