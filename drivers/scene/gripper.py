@@ -244,6 +244,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._expect_open()
         width, _, pressed, _ = self._measure()
         blocked = abs(width - self._stood) <= STILL and pressed >= PRESSING * self._force
+        blocked = blocked and bool(self.scene.contacts(self.body.name))  # the force is that of the last step
         if not blocked or force != self._force or self._target > width - AT_TARGET:  # else nothing moves
             self._resting, self._stood_since = False, self.scene.steps
         self._force = force

@@ -34,7 +34,7 @@ Hide = Callable[..., None]
 
 
 @pytest.fixture
-def hide(monkeypatch: pytest.MonkeyPatch) -> Hide:
+def hide(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Hide:
     """Make packages look as if they were not installed."""
     find_spec, distribution = importlib.util.find_spec, importlib.metadata.distribution
 
@@ -47,6 +47,7 @@ def hide(monkeypatch: pytest.MonkeyPatch) -> Hide:
                 raise importlib.metadata.PackageNotFoundError(name)
             return distribution(name)
 
+        monkeypatch.syspath_prepend(tmp_path)  # packages that were found are looked for again
         monkeypatch.setattr(importlib.util, "find_spec", spec)
         monkeypatch.setattr(importlib.metadata, "distribution", metadata)
 
