@@ -132,6 +132,8 @@ class Person:
         self.screen = io.StringIO()
         self._read = 0
         self.failure: BaseException | None = None
+        self.over = False
+        """Whether the program has ended."""
 
     def open(self, **options: Any) -> hal.Rig:
         """Open the program's rig, and begin."""
@@ -154,7 +156,8 @@ class Person:
                 self._tap("home", " s, success")
         except BaseException as failure:  # of the test, which fails with it
             self.failure = failure
-            _thread.interrupt_main()
+            if not self.over:
+                _thread.interrupt_main()
 
     def _sees(self, text: str) -> bool:
         """Return whether a text is printed after what was seen before."""
@@ -171,7 +174,7 @@ class Person:
         return bool(np.abs(self.arm.state().dq_set).max() > 1e-3)
 
     def _hold(self, until: Callable[[], bool]) -> None:
-        """Hold L2 until a condition; press anew if a press did not count, or a busy computer stopped."""
+        """Hold L2 until a condition; press anew if a press did not count, or a busy computer stopped the arm."""
         met = until()
         while not met:
             self.pad.release("l2")
@@ -255,20 +258,11 @@ def test_what_a_person_collects_is_replayed_and_imitated(
     fr3: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     person = Person(hal.open)
-    fr3 = Bench(fr3.rig, [*fr3.overrides, "robots.arm.move_speed=0.3"])
-    words = [
-        "--out",
-        str(tmp_path / "data"),
-        "--episodes",
-        "2",
-        "--task",
-        "move",
-        "--set",
-        "gamepads={pad: {sim: true}}",
-    ]
+    fr3 = Bench(fr3.rig, [*fr3.overrides, "robots.arm.move_speed=0.3", "gamepads={pad: {sim: true}}"])
     with monkeypatch.context() as patch, redirect_stdout(person.screen):
         patch.setattr(hal, "open", person.open)
-        status = collect([*words, *fr3.words])
+        status = collect(["--out", str(tmp_path / "data"), "--episodes", "2", *fr3.words])
+    person.over = True
     if person.failure is not None:
         raise AssertionError(person.screen.getvalue()) from person.failure
     assert status == 0, person.screen.getvalue()
