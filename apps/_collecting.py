@@ -313,7 +313,8 @@ class CollectRun:
             return home if session.drives_home else ""
         if not self._allowed:
             return ""
-        place = "place the objects; " if session.drives_home and self.phase == "ready" else ""
+        real = session.drives_home and not self.rig.has_world
+        place = "place the objects; " if real and self.phase == "ready" else ""
         return f"{place}{self._buttons(self._allowed)}"
 
     def _buttons(self, actions: Collection[str]) -> str:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import _thread
+import io
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +20,10 @@ from can_kit import EmulatorProcess
 from waiting import wait_until
 
 import hal
+from hal.apps.collect import main as collect
 from hal.apps.replay import main as replay
-from hal.recording import Recorder
+from hal.apps.rollout import main as rollout
+from hal.recording import Dataset, Recorder
 from hal.skills import SkillProgress, grasp, grasp_pose, locate_by_truth
 
 from .franka_kit import Emulator, free_host
@@ -114,6 +122,172 @@ def test_an_episode_of_pick_and_place_is_recorded_and_replayed(fr3: Bench, tmp_p
     assert shown.returncode == 0, shown.stdout + shown.stderr
     with fr3.open() as rig:  # the emulator's world goes on between programs
         assert rig.world.pose("cube").position == pytest.approx(put, abs=2e-3)
+
+
+class Person:
+    """Reads what ``hal collect`` prints, looks at the arm, and moves the cube with a pad: once to a place, once up."""
+
+    def __init__(self, opened: Callable[..., hal.Rig]) -> None:
+        self._opened = opened
+        self.screen = io.StringIO()
+        self._read = 0
+        self.failure: BaseException | None = None
+        self.over = False
+        """Whether the program has ended."""
+
+    def open(self, **options: Any) -> hal.Rig:
+        """Open the program's rig, and begin."""
+        self.rig = self._opened(**options)
+        self.arm, self.pad = self.rig.robots["arm"], self.rig.driver("pad")
+        threading.Thread(target=self._collect, daemon=True).start()
+        return self.rig
+
+    def _collect(self) -> None:
+        try:
+            for last in (False, True):
+                wait_until(lambda: self._sees("resetting"), "asked to drive home")
+                self._hold(lambda: self._sees("ready"))
+                self.pad.release("l2")
+                self._tap("south", "RECORDING")
+                self._grasp()
+                if not last:
+                    self._put_down()
+                self.pad.release("l2")
+                self._tap("home", " s, success")
+        except BaseException as failure:  # of the test, which fails with it
+            self.failure = failure
+            if not self.over:
+                _thread.interrupt_main()
+
+    def _sees(self, text: str) -> bool:
+        """Return whether a text is printed after what was seen before."""
+        at = self.screen.getvalue().find(text, self._read)
+        self._read = max(self._read, at + len(text) if at >= 0 else 0)
+        return at >= 0
+
+    def _tap(self, button: str, text: str) -> None:
+        self.pad.press(button)
+        wait_until(lambda: self._sees(text), f"printed: {text}")
+        self.pad.release(button)
+
+    def _moves(self) -> bool:
+        return bool(np.abs(self.arm.state().dq_set).max() > 1e-3)
+
+    def _hold(self, until: Callable[[], bool]) -> None:
+        """Hold L2 until a condition; press anew if a press did not count, or a busy computer stopped the arm."""
+        met = until()
+        while not met:
+            self.pad.release("l2")
+            wait_until(lambda: not self.rig.gamepads["pad"].state().pressed("l2"), "released")
+            self.pad.press("l2")
+            limit = time.monotonic() + 1.0
+            while not (met := until()) and (time.monotonic() < limit or self._moves()):
+                time.sleep(0.01)
+
+    def _follows(self) -> bool:
+        return self.arm.state().status is hal.RobotStatus.FOLLOWING
+
+    def _drive(self, until: Callable[[Any], bool], *buttons: str, **sticks: float) -> None:
+        def there() -> bool:
+            return until(self.arm.state().tcp.position)
+
+        while not there():
+            self._hold(self._follows)
+            self.pad.press(*buttons)
+            for axis, value in sticks.items():
+                self.pad.stick(axis, value)
+            wait_until(lambda: there() or not self._follows(), "there")
+            self.pad.release(*buttons)
+            for axis in sticks:
+                self.pad.stick(axis, 0.0)
+            wait_until(lambda: not self._moves(), "at rest")
+        self._hold(self._follows)
+
+    def _grasp(self) -> None:
+        gripper = self.arm.gripper
+        assert gripper is not None
+        self._drive(lambda tcp: tcp[0] > 0.54, "r1", dpad_y=1.0)
+        self._drive(lambda tcp: tcp[2] < 0.03, "r1")
+        self.pad.stick("r2", 1.0)
+        wait_until(lambda: gripper.state().grasped, "grasped")
+        self._drive(lambda tcp: tcp[2] > 0.1, "l1")
+
+    def _put_down(self) -> None:
+        gripper = self.arm.gripper
+        assert gripper is not None
+        self._drive(lambda tcp: tcp[1] < -0.08, dpad_x=1.0)
+        self._drive(lambda tcp: tcp[2] < 0.033, "r1")
+        self.pad.stick("r2", 0.0)
+        wait_until(lambda: gripper.state().width > 0.07, "open")
+        self._drive(lambda tcp: tcp[2] > 0.1, "l1")
+
+
+POLICY = """
+import numpy as np
+
+import hal
+from hal.recording import Dataset
+
+EPISODE = Dataset("data").episodes[0]
+T = EPISODE.stamps["robot.arm"] - EPISODE.stamps["robot.arm"][0]
+ROWS = EPISODE.columns["rig.setpoint"]
+PUT = EPISODE.columns["rig.object.cube"][-1, :3]
+
+
+class Imitates:
+    def reset(self, seed):
+        self.start = None
+
+    def __call__(self, observation):
+        if self.start is None:
+            self.start = observation.t + 0.5
+        row = min(int(np.searchsorted(T, observation.t - self.start)), len(T) - 1)
+        rows = slice(row, row + 15)
+        return hal.JointChunk(self.start + T[rows], ROWS[rows, :7]), float(ROWS[row, 7] < 0.04)
+
+
+def is_put(rig, observation):
+    arm = observation.robots["arm"]
+    off = np.abs(rig.world.pose("cube").position - PUT).max()
+    return bool(off < 5e-3 and arm.tcp.position[2] > 0.08 and arm.tcp.position[1] < 0.0)
+"""
+"""Plays what was collected; it succeeds when the cube is within 5 mm of where the person put it."""
+
+
+def test_what_a_person_collects_is_replayed_and_imitated(
+    fr3: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person = Person(hal.open)
+    fr3 = Bench(fr3.rig, [*fr3.overrides, "robots.arm.move_speed=0.3", "gamepads={pad: {sim: true}}"])
+    with monkeypatch.context() as patch, redirect_stdout(person.screen):
+        patch.setattr(hal, "open", person.open)
+        status = collect(["--out", str(tmp_path / "data"), "--episodes", "2", *fr3.words])
+    person.over = True
+    if person.failure is not None:
+        raise AssertionError(person.screen.getvalue()) from person.failure
+    assert status == 0, person.screen.getvalue()
+    moved, lifted = (one.columns["rig.object.cube"][:, :3] for one in Dataset(tmp_path / "data").episodes)
+    for cube in (moved, lifted):
+        assert cube[0] == pytest.approx(AREA.cube["position"], abs=2e-3), "each begins with the cube where it belongs"
+        assert cube[:, 2].max() > cube[0, 2] + 0.05
+    assert moved[-1, 1] < moved[0, 1] - 0.05
+    assert moved[-1, 2] == pytest.approx(moved[0, 2], abs=2e-3)
+    assert lifted[-1, 2] > lifted[0, 2] + 0.05, "it is still held"
+
+    shown = run_here(replay, str(tmp_path / "data"), "--unattended", *fr3.words)
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    with fr3.open() as rig:
+        assert rig.world.pose("cube").position == pytest.approx(moved[-1], abs=5e-3)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "imitating.py").write_text(POLICY)
+    judged = ["--policy", "imitating:Imitates", "--success", "imitating:is_put", "--report", "report.json"]
+    done = run_here(rollout, *judged, "--unattended", *fr3.words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 of 1 marked episodes succeeded" in done.stdout
+    (episode,) = json.loads((tmp_path / "report.json").read_text())["episodes"]
+    assert episode["seconds"] > 5.0, "from the start on, where the cube was put back"
 
 
 def miss_and_lose(rig: hal.Rig) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 import hal
 from hal.skills import SkillProgress, gentle_grasp, grasp, object_from_points, push, push_to
@@ -51,10 +52,15 @@ def rig(robot: Emulator) -> Iterator[hal.Rig]:
 
 
 @pytest.fixture(autouse=True, params=range(20 if os.environ.get("HAL_SOAK") == "1" else 1))
-def _again(rig: hal.Rig) -> None:
-    """Repeat every test; a fault of one of them is recovered."""
-    if arm_of(rig).state().fault is not None:
-        arm_of(rig).recover()
+def _again(robot: Emulator, rig: hal.Rig) -> None:
+    """Repeat every test, with an empty hand; a fault of one of them is recovered."""
+    arm = arm_of(rig)
+    if arm.state().fault is not None:
+        arm.recover()
+    robot.control.send("hand object none")
+    gripper = arm.gripper
+    assert gripper is not None
+    wait_until(lambda: not gripper.state().grasped, "empty")
 
 
 def at(phase: str, call: Callable[[], Any]) -> Callable[[SkillProgress], None]:
@@ -91,7 +97,8 @@ def test_a_grasp(
     robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], when: str, words: str, options: dict[str, Any]
 ) -> None:
     arm, options = arm_of(rig), dict(options)
-    robot.control.send(f"hand object {WIDTH if reason == 'dropped' else 'none'}")
+    if reason == "dropped":
+        robot.control.send(f"hand object {WIDTH}")
     pose = options.pop("pose", POSE)
     tell = at(when, lambda: robot.control.send(f"hand {words}"))
     result = grasp(arm, pose, **OPTIONS | options, progress=tell)
@@ -110,7 +117,6 @@ def test_a_grasp(
     ],
 )
 def test_a_gentle_grasp(robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], words: str) -> None:
-    robot.control.send("hand object none")
     tell = at("touch", lambda: robot.control.send(f"hand {words}"))
     result = gentle_grasp(arm_of(rig), POSE, WIDTH, touch_speed=0.05, **OPTIONS, progress=tell)
     assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
@@ -133,12 +139,9 @@ def test_a_push(robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], b
     ("reason", "seen", "phases"),
     [("not_seen", False, ["locate"]), ("off_goal", True, ["locate", "push", "locate"])],
 )
-def test_a_push_to_a_goal(robot: Emulator, rig: hal.Rig, reason: str, seen: bool, phases: list[str]) -> None:
+def test_a_push_to_a_goal(rig: hal.Rig, reason: str, seen: bool, phases: list[str]) -> None:
     """The object that is seen does not move: there is none."""
     arm = arm_of(rig)
-    assert arm.gripper is not None
-    arm.gripper.open()  # the hand would go on holding an object that the test before put there
-    robot.control.send("hand object none")
     corners = POSE.position + 0.02 * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     found = object_from_points(corners) if seen else None
     goal = POSE.position[:2] + [0.04, 0.0]
