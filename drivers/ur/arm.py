@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import time
-from math import inf
+from math import inf, isfinite
 from typing import Any, ClassVar
 
 from hal.driver import Reading, RobotDriver, Setpoint
@@ -27,6 +27,7 @@ from .faults import (
     SILENT,
     WATCHDOG,
     mode_fault,
+    safety_fault,
     scaling_fault,
 )
 from .link import UrLink
@@ -176,20 +177,22 @@ class UrArm(RobotDriver):
             link.note_stopped()
         if self.engaged and fault is not None:
             self._fault, self.engaged = fault, False
+            link.end()
         return fault or self._fault
 
     def _find_fault(self, safety: int, playing: bool) -> Fault | None:
         """Return what keeps the arm from moving now."""
         receive = self._link.receive
-        if safety in SAFETY:
-            return SAFETY[safety]
+        stop = safety_fault(safety)
+        if stop is not None:
+            return stop
         mode, slider = receive.getRobotMode(), receive.getTargetSpeedFraction()
         if mode != RUNNING:
             return mode_fault(mode)
-        if slider < _FULL:
+        if not slider >= _FULL:  # also NaN
             return scaling_fault(slider, slider=True)
         scaling = receive.getSpeedScaling()
-        return scaling_fault(scaling, slider=False) if self.engaged and playing and scaling < _FULL else None
+        return scaling_fault(scaling, slider=False) if self.engaged and playing and not scaling >= _FULL else None
 
     def _judge_program(self, now: float, playing: bool, target: list[float]) -> Fault | None:
         """Return why the control program ended, or does not follow.
@@ -199,7 +202,7 @@ class UrArm(RobotDriver):
         link, sent = self._link, self._link.sent
         if playing and link.running:
             off = 0.0 if sent is None else max(abs(a - b) for a, b in zip(sent, target, strict=True))
-            return NOT_FOLLOWING if off > self._farthest else None
+            return None if isfinite(sum(target)) and off <= self._farthest else NOT_FOLLOWING
         if self._t_ended == inf:
             self._t_ended, link.local = now, False
             link.ask_remote()

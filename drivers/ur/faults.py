@@ -6,8 +6,8 @@ from hal.errors import Fault
 
 RUNNING = 7
 """``robot_mode`` of an arm whose power is on and whose brakes are released."""
-PLAYING = 2
-"""``runtime_state`` of a controller that runs a program."""
+STOPPED, PLAYING = 1, 2
+"""``runtime_state`` of a controller that runs no program, and of one that does; otherwise it is paused, or changes."""
 PROTECTIVE_STOP = 3
 """``safety_mode``"""
 UNLOCK_AFTER = 5.0
@@ -31,6 +31,14 @@ SAFETY = {
     9: Fault("SAFETY_FAULT", "fault of the safety system", "see the pendant's log; restart the controller"),
 }
 """``safety_mode`` -> its fault. 1 is normal, 2 reduced."""
+
+
+def safety_fault(mode: int) -> Fault | None:
+    """Return the fault of a ``safety_mode``: any other than normal and reduced is one."""
+    return (
+        None if mode in (1, 2) else SAFETY.get(mode) or Fault("SAFETY_STOP", f"safety mode {mode}", "see the pendant")
+    )
+
 
 LOCAL = Fault(
     "LOCAL_CONTROL",
@@ -65,6 +73,7 @@ NOT_FOLLOWING = Fault(
     "the controller does not follow its set-points",
     "look at the pendant for a limit or a scaled speed",
 )
+NO_DASHBOARD = Fault("NO_DASHBOARD", "its dashboard does not answer", "on the pendant allow the dashboard (Services)")
 SILENT = Fault("SILENT", "the controller sends no states any more", "check the cable and that the controller is on")
 NO_CONTROLLER = Fault("NO_CONTROLLER", "it does not answer", "check real.host, the cable, the subnet, and firewalls")
 

@@ -23,7 +23,7 @@ from hal.errors import ConnectionLost, Fault
 from hal.host.scheduling import PRIORITY
 from hal.lock import DeviceLock
 
-from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN
+from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN, STOPPED
 from .settings import UrSettings
 
 __all__ = ["WATCHDOG_HZ", "UrLink", "lock_arm", "probe"]
@@ -35,6 +35,12 @@ _KICK = 0.02
 """Time after which the watchdog is kicked if no set-point was sent, s."""
 _START = 0.8
 """Longest time until the control program runs, s."""
+_STALE = 1.0
+"""Time after which a request to start it is not carried out any more, s: the session that wanted it has given up."""
+_ANSWER = 3.0
+"""Longest time that a caller waits for the dashboard, s."""
+_END = 0.3
+"""Longest time until a program that is ended is over, s."""
 _RETRY = 0.5
 """Time between attempts to connect again, s."""
 _VARIABLES = ["timestamp", "target_q", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "robot_mode"]
@@ -115,7 +121,9 @@ class UrLink:
         self._wake = threading.Condition()
         self._jobs: list[Callable[[], None]] = []
         self._thread: threading.Thread | None = None
-        self._ours = self._closing = False
+        self._ours = self._ending = False
+        self._ended = threading.Event()
+        """Ends the thread."""
         self._lock: DeviceLock | None = None
 
     # Called by the cycle.
@@ -153,8 +161,8 @@ class UrLink:
                 raise ConnectionLost.of(self.name, REGISTERS_TAKEN) from None
             raise ConnectionLost(f"{self.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code) from error
         _kept.extend((self._dashboard, self.receive, self._control))
-        self._closing = False
-        self._thread = threading.Thread(target=self._run, name=f"ur-{self.name}", daemon=True)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=[self._ended], name=f"ur-{self.name}", daemon=True)
         self._thread.start()
 
     def send(self, q: list[float]) -> None:
@@ -166,12 +174,19 @@ class UrLink:
     def start(self) -> None:
         """Start the control program soon: then ``running`` is True, or ``refused`` says why not."""
         self.refused, self.starting = None, True
-        self._call(self._start)
+        asked = time.monotonic()
+        self._call(lambda: self._start(asked))
 
     def note_stopped(self) -> None:
-        """Note that no program is running."""
+        """Note that no program is running, or that it is paused."""
         if not self.starting:
-            self.running = self._ours = False
+            self.end()
+
+    def end(self) -> None:
+        """End the control program soon: left alone, it goes on to the last set-point, also after a pause."""
+        if self._ours:
+            self.running, self._ours, self._ending = False, False, True
+            self._call(self._end_program)
 
     def ask_remote(self) -> None:
         """Ask soon whether the controller is in local control."""
@@ -181,42 +196,53 @@ class UrLink:
         """Unlock a protective stop; return why that was not possible. Blocks for at most 3 s."""
         answers: list[str] = []
 
-        def unlock() -> None:
+        def unlock(given_up: threading.Event) -> None:
             try:
                 self._dashboard.closeSafetyPopup()
-                self._dashboard.unlockProtectiveStop()
-                answers.append("")
+                if not given_up.is_set():
+                    self._dashboard.unlockProtectiveStop()
+                    answers.append("")
             except RuntimeError as error:  # the controller's own words
                 answers.append(str(error))
 
         self._finish(unlock)
-        return answers[0] if answers else "the dashboard does not answer"
+        return answers[0] if answers else "the dashboard does not answer in time, and may unlock it late: keep away"
 
-    def ask_local(self) -> bool:
-        """Return whether the controller is in local control. Blocks for at most 3 s."""
-        self._finish(self._ask_remote)
-        return self.local
+    def ask_local(self) -> bool | None:
+        """Return whether the controller is in local control; None if it does not say. Blocks for at most 3 s."""
+        answers: list[bool] = []
 
-    def _finish(self, job: Callable[[], None]) -> None:
-        done = threading.Event()
+        def ask(given_up: threading.Event) -> None:
+            self._ask_remote()
+            answers.append(self.local)
+
+        self._finish(ask)
+        return answers[0] if answers else None
+
+    def _finish(self, job: Callable[[threading.Event], None]) -> None:
+        """Wait until the thread has done a job; it is told when nobody waits any more."""
+        done, given_up = threading.Event(), threading.Event()
 
         def run() -> None:
             try:
-                job()
+                if not given_up.is_set():
+                    job(given_up)
             finally:
                 done.set()
 
         self._call(run)
-        done.wait(3.0)
+        if not done.wait(_ANSWER):
+            given_up.set()
 
     def lose(self) -> None:
-        """Note that the controller is silent: what it does is no longer known."""
-        self.running, self.starting, self._target = False, False, None
+        """Note that the controller is silent: what it does is no longer known, and its watchdog ends our program."""
+        self.running = self._ours = self.starting = False
+        self._target = None
 
     def close(self) -> None:
         """End the control program, and disconnect. Idempotent."""
         with self._wake:
-            self._closing = True
+            self._ended.set()
             self._wake.notify()
         thread, self._thread = self._thread, None
         if thread is not None:
@@ -233,10 +259,10 @@ class UrLink:
 
     # The thread.
 
-    def _run(self) -> None:
+    def _run(self, ended: threading.Event) -> None:
         receive, control = self.receive, self._control
         last = time.monotonic()
-        while not self._closing:
+        while not ended.is_set():
             with self._wake:
                 if not self._jobs and self._target is None:
                     self._wake.wait(_KICK)
@@ -249,17 +275,22 @@ class UrLink:
             try:
                 if not receive.isConnected() or not control.isConnected():
                     self.lose()
-                    self._reconnect(receive, control)
+                    self._reconnect(receive, control, ended)
                 elif jobs:
+                    if not self._dashboard.isConnected():  # it hangs up after an answer that was late
+                        self._dashboard.disconnect()
+                        self._dashboard.connect()
                     for job in jobs:
                         job()
                 elif self.running:
                     self._serve(control, target)
-            except RuntimeError as error:
+            except Exception as error:  # RuntimeError, but for answers that it cannot read
                 print(f"{self.name}: ur_rtde: {error}", file=sys.stderr)
                 self.lose()
             last = time.monotonic()
         with contextlib.suppress(RuntimeError):
+            if self._ending and control.isConnected():
+                self._end_program()
             if self._ours and control.isConnected():
                 control.stopScript()
             control.disconnect()
@@ -271,12 +302,8 @@ class UrLink:
         elif control.servoJ(target, 0.0, 0.0, 1.0 / self.rate_hz, self.settings.lookahead_time, self.settings.gain):
             self.sent = target
 
-    def _reconnect(self, receive: Any, control: Any) -> None:
-        for _ in range(int(_RETRY / _KICK)):
-            time.sleep(_KICK)
-            if self._closing:
-                return
-        if probe(self.settings.host):
+    def _reconnect(self, receive: Any, control: Any, ended: threading.Event) -> None:
+        if ended.wait(_RETRY) or probe(self.settings.host):
             return
         if not receive.isConnected():
             receive.reconnect()
@@ -288,12 +315,25 @@ class UrLink:
     def _ask_remote(self) -> None:
         self.local = self._has_remote and not self._dashboard.isInRemoteControl()
 
-    def _start(self) -> None:
+    def _end_program(self) -> None:
+        """End the control program, and clear the command in its register, which the next program would execute."""
+        self._ending = False
+        if self.receive.getRuntimeState() != STOPPED:
+            with contextlib.suppress(RuntimeError):  # over already, or in local control, where it is over soon
+                self._dashboard.stop()
+            end = time.monotonic() + _END
+            while self.receive.getRuntimeState() != STOPPED and time.monotonic() < end:
+                time.sleep(0.002)
+        if self.receive.getRuntimeState() == STOPPED:
+            self._control.kickWatchdog()  # without a program it only clears the register
+
+    def _start(self, asked: float) -> None:
+        refused: Fault | None = NOT_STARTED
         try:
-            self.refused = self._start_program()
-            self.running = self.refused is None
+            if time.monotonic() - asked < _STALE:
+                refused = self._start_program()
         finally:
-            self.starting = False
+            self.running, self.refused, self.starting = refused is None, refused, False
 
     def _start_program(self) -> Fault | None:
         """Start the control program with its watchdog; return why that was not possible."""
@@ -301,10 +341,15 @@ class UrLink:
         self._ask_remote()
         if self.local:
             return LOCAL
-        if self.receive.getRuntimeState() == PLAYING and not self._ours:
-            return OTHER_PROGRAM
+        end = time.monotonic() + _END  # of ours that was lost, and of states that come late
+        while self.receive.getRuntimeState() == PLAYING and not self._ours:
+            if time.monotonic() > end:
+                return OTHER_PROGRAM
+            time.sleep(0.002)
         self._ours, self._target, self.sent, self.longest_gap = True, None, None, 0.0
         end = time.monotonic() + _START
+        if self.receive.getRuntimeState() == STOPPED:
+            control.kickWatchdog()  # clears the register, where the set-point of an ended program may be
         control.reuploadScript()  # also ends an old one of ours
         while not (control.isProgramRunning() and self.receive.getRuntimeState() == PLAYING):
             if time.monotonic() > end:

@@ -18,7 +18,17 @@ from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 
 from .arm import find_tcp
-from .faults import LOCAL, NO_CONTROLLER, OTHER_PROGRAM, PLAYING, RUNNING, SAFETY, mode_fault, scaling_fault
+from .faults import (
+    LOCAL,
+    NO_CONTROLLER,
+    NO_DASHBOARD,
+    OTHER_PROGRAM,
+    PLAYING,
+    RUNNING,
+    mode_fault,
+    safety_fault,
+    scaling_fault,
+)
 from .link import UrLink, probe
 from .settings import UrSettings
 
@@ -64,10 +74,11 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
 def _check_state(link: UrLink) -> Iterator[CheckResult]:
     receive = link.receive
     safety, mode, slider = receive.getSafetyMode(), receive.getRobotMode(), receive.getTargetSpeedFraction()
-    found = [SAFETY[safety]] if safety in SAFETY else [mode_fault(mode)] if mode != RUNNING else []
-    found += [LOCAL] if link.ask_local() else []
+    stop, local = safety_fault(safety), link.ask_local()
+    found = [stop] if stop is not None else [mode_fault(mode)] if mode != RUNNING else []
+    found += [LOCAL] if local else [NO_DASHBOARD] if local is None else []
     found += [OTHER_PROGRAM] if receive.getRuntimeState() == PLAYING else []
-    found += [scaling_fault(slider, slider=True)] if slider < 1.0 else []
+    found += [scaling_fault(slider, slider=True)] if not slider >= 1.0 else []
     for fault in found:
         yield CheckResult("state", "warn", fault.cause, fault.remedy)
     if not found:

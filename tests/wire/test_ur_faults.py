@@ -105,6 +105,48 @@ def test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover(
     assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
 
 
+def stop_in_motion(rig: hal.Rig, emulator: UrEmulator, cause: str) -> None:
+    """Stop the arm by a fault in a motion, and wait until it rests."""
+    arm = rig.robots["arm"]
+    arm.move_to(arm.home, unattended=True, speed=0.3)
+    with pytest.raises(hal.HalError), arm.control(rate_hz=50, unattended=True) as control:
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointVelocity([0, 0, 0, 0.5, 0, 0]))
+            if max(emulator.status()["dq"]) > 0.3:
+                emulator.control.send(cause)
+            assert tick.elapsed < 10.0
+    emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3)
+
+
+def test_a_safeguard_that_is_closed_again_moves_nothing(rig: hal.Rig, emulator: UrEmulator) -> None:
+    """It only pauses a program, which would go on to its last set-point by itself."""
+    stop_in_motion(rig, emulator, "safeguard on")
+    emulator.wait_for(lambda status: not status["program"])
+    before = emulator.status()["q"]
+    emulator.control.send("safeguard off")
+    time.sleep(0.3)
+    assert emulator.status()["q"] == pytest.approx(before, abs=1e-6)
+    recover(rig, rig.robots["arm"])
+
+
+def test_an_arm_that_was_moved_by_hand_stays_there_when_the_next_session_opens(
+    rig: hal.Rig, emulator: UrEmulator
+) -> None:
+    """The register of the controller still had the set-point at which the last program was stopped."""
+    arm = rig.robots["arm"]
+    stop_in_motion(rig, emulator, "program")
+    emulator.control.send("jog 3 -0.3")
+    moved, events = emulator.status()["q"], emulator.status()["events"]
+    recover(rig, arm)
+    with arm.control(rate_hz=50, unattended=True) as control:
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointVelocity([0.0] * 6))
+            if tick.elapsed > 0.4:
+                break
+    assert emulator.status()["target_q"] == pytest.approx(moved, abs=1e-4)
+    assert not any("C153" in event for event in emulator.status()["events"] if event not in events)
+
+
 def test_a_session_gives_the_controller_load_and_tcp_of_the_rig(rig: hal.Rig, emulator: UrEmulator) -> None:
     rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
     status = emulator.status()

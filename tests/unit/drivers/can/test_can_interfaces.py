@@ -150,7 +150,11 @@ def test_the_bus_load_is_that_of_its_frames() -> None:
     [
         ({"interface": "socketcan", "channel": "can77"}, DeviceNotFound, {"no_interface", "no_socketcan"}),
         ({"interface": "socketcam", "channel": "can0"}, ConfigError, {"unknown_interface"}),
-        ({"interface": "robotell", "channel": "COM1", "bus": {"nosuch": 1}}, HalError, {"bad_bus", "bus_lost", "driver_missing"}),
+        (
+            {"interface": "robotell", "channel": "COM1", "bus": {"nosuch": 1}},
+            HalError,
+            {"bad_bus", "bus_lost", "driver_missing"},
+        ),
     ],
 )
 def test_a_bus_that_cannot_be_opened_is_named(options: Any, error: type[HalError], code: set[str]) -> None:

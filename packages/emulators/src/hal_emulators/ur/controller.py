@@ -15,7 +15,7 @@ from .motion import ROBOTS, TargetMotion, forward
 
 __all__ = ["POWER_OFF", "RUNNING", "Controller"]
 
-STOPPED, PLAYING = 1, 2
+STOPPED, PLAYING, PAUSED = 1, 2, 4
 """``runtime_state``."""
 RUNNING, IDLE, POWER_OFF = 7, 5, 3
 """``robot_mode``."""
@@ -51,6 +51,8 @@ class Controller:
         """Registers that the program writes."""
         self.program = ""
         """Name of the program that is running."""
+        self.paused = False
+        """Whether the program is paused."""
         self.offset = 0
         self.events: list[str] = []
         """What happened, the newest last."""
@@ -84,7 +86,7 @@ class Controller:
         self._starts, self._watchdog, self._busy, self._executing = None, None, None, False
         if self.program:
             self.note(f"program {self.program} stopped: {why}")
-            self.program = ""
+            self.program, self.paused = "", False
             self.motion.stop(_PROGRAM_STOP)
 
     def write_inputs(self, values: dict[str, float]) -> None:
@@ -112,10 +114,18 @@ class Controller:
         self.note("emergency stop " + ("pressed" if pressed else "released"))
 
     def set_safeguard(self, active: bool) -> None:
-        """Switch the safeguard stop (a light curtain) on or off."""
-        self.safety_mode = SAFEGUARD_STOP if active else NORMAL
-        if active:
-            self.stop_program("safeguard stop")
+        """Switch the safeguard stop (a light curtain) on or off: it pauses a program, which then goes on by itself."""
+        if self.safety_mode in (NORMAL, SAFEGUARD_STOP):
+            self.safety_mode = SAFEGUARD_STOP if active else NORMAL
+            self.paused, self._t_written = active and bool(self.program), self.now
+            if active:
+                self.motion.stop(_PROTECTIVE_DECELERATION)
+
+    def jog(self, joint: int, angle: float) -> None:
+        """Move a joint by hand, rad. Raises ValueError while a program runs."""
+        if self.program:
+            raise ValueError("a program is running")
+        self.motion.place([q + angle * (k == joint) for k, q in enumerate(self.motion.q)])
 
     def set_remote(self, remote: bool) -> None:
         """Switch between remote and local control; a switch to local ends a program that was sent."""
@@ -185,9 +195,10 @@ class Controller:
             self._starts, self._t_written = None, self.now
             self.note(f"program {self.program} runs")
             self.outputs[f"output_int_register_{self.offset}"] = 1
-        if self.program and self._watchdog is not None and self.now - self._t_written > self._watchdog:
+        running = self.program if not self.paused else ""
+        if running and self._watchdog is not None and self.now - self._t_written > self._watchdog:
             self.stop_program("watchdog")
-        if self.program == "rtde_control":
+        elif running == "rtde_control":
             self._run_script()
         why = self.motion.step()
         if why is not None:
@@ -262,7 +273,7 @@ class Controller:
             "safety_status": self.safety_mode,
             "robot_status_bits": (self.robot_mode == RUNNING) | (2 if self.program else 0),
             "safety_status_bits": _SAFETY_BITS[self.safety_mode],
-            "runtime_state": PLAYING if self.program else STOPPED,
+            "runtime_state": PAUSED if self.paused else PLAYING if self.program else STOPPED,
             "speed_scaling": motion.scale,
             "target_speed_fraction": motion.scale,
             "payload": self.payload,

@@ -82,10 +82,14 @@ class TargetMotion:
 
     def __init__(self, q: Sequence[float], dt: float) -> None:
         self.dt = dt
-        self.q, self.dq, self.ddq = list(q), [0.0] * 6, [0.0] * 6
-        self.actual_q, self.actual_dq = list(q), [0.0] * 6
         self.scale = 1.0
         """Share of the speed that the slider allows."""
+        self.place(q)
+
+    def place(self, q: Sequence[float]) -> None:
+        """Be somewhere else, at rest."""
+        self.q, self.dq, self.ddq = list(q), [0.0] * 6, [0.0] * 6
+        self.actual_q, self.actual_dq = list(q), [0.0] * 6
         self.hold()
 
     def hold(self) -> None:

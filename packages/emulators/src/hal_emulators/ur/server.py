@@ -46,6 +46,7 @@ COMMANDS = {
     "power": ("on|off", "switch the arm on and release its brakes, or off"),
     "remote": ("on|off", "remote or local control"),
     "slider": ("SHARE", "the speed slider, 0 to 1"),
+    "jog": ("JOINT RAD", "move a joint (0 to 5) by hand, while no program runs"),
     "program": ("[NAME]", "run another program, or stop the one that is running"),
     "lose": ("SHARE", "leave out this share of the states"),
     "late": ("S", "send states so much later"),
@@ -336,6 +337,7 @@ class UrServer:
             "power": lambda: controller.set_power(RUNNING if _switch(values[0]) else POWER_OFF),
             "remote": lambda: controller.set_remote(_switch(values[0])),
             "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
+            "jog": lambda: controller.jog(int(_number(values[0], 0, 5)), _number(values[1], -3.0, 3.0)),
             "program": lambda: (
                 controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant")
             ),
