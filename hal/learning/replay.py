@@ -449,7 +449,7 @@ class TrajectoryPlayer:
                     if scaling is not None:
                         self._measure(scaling, seen)
                         self.pauses += 1
-                    scaling, seen = None, tick.t
+                    scaling, seen, self._wait_ends = None, tick.t, math.inf
                     on_turn(self, False)
                     continue
                 if self._waits_for_fingers(tick.t):
@@ -476,8 +476,9 @@ class TrajectoryPlayer:
         if gripper is None or grip is None or gripper.trouble or not self._waits or self.progress < self._waits[0]:
             return False
         state = gripper.state()
-        taken = abs(state.width_target - grip[0]) <= _MOVED
-        if taken and not state.moving and state.outcome is not GripperOutcome.RUNNING:
+        taken = abs(state.width_target - min(grip[0], gripper.width_max)) <= _MOVED
+        open_yet = state.moving or state.outcome in (GripperOutcome.RUNNING, GripperOutcome.STOPPED)  # by a pause
+        if taken and not open_yet:
             self._waits = [wait for wait in self._waits if wait > self.progress]
             self._wait_ends = math.inf
             return False
@@ -511,11 +512,18 @@ class TrajectoryPlayer:
         if now < scaling.t:  # from where it rests to where it begins
             times.append(scaling.t)
             points.append(trajectory.interpolate(trajectory.q_set, scaling.s))
+        rest = next((wait for wait in self._waits if wait > scaling.s), math.inf)
         for k in range(begin, min(last, len(trajectory.t))):
-            if trajectory.t[k] > scaling.s:
+            if rest >= trajectory.t[k] > scaling.s:  # not beyond a wait for the fingers: this program may be late
                 times.append(scaling.time_at(float(trajectory.t[k])))
                 points.append(trajectory.q_set[k])
-        if last >= len(trajectory.t):
+        if trajectory.t[min(last, len(trajectory.t)) - 1] > rest:
+            if not times:
+                control.hold_for(_AHEAD)
+                return
+            times.append(times[-1] + _AHEAD)
+            points.append(points[-1])
+        elif last >= len(trajectory.t):
             times.append(max(now, scaling.time_at(trajectory.duration)) + _SETTLE)
             points.append(trajectory.q_set[-1])
         control.send(JointChunk(times, points))

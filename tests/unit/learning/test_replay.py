@@ -212,6 +212,38 @@ def test_releasing_the_dead_man_pauses_and_a_press_continues(episode: Recorded) 
     assert player.deviation.rms.max() < 0.01, "and on from there"
 
 
+def test_an_arm_that_waits_for_its_fingers_waits_on_after_a_pause() -> None:
+    """The fingers stop in the pause, and have to close on after it."""
+    episode = record(rest=(1.0, 3.0))
+    slow = "robots.panda.gripper.speed=0.02"
+    with opened("mock", pad=None, overrides=[*BARE, "gamepads.pad.model=auto", slow]) as rig:
+        arm, hand = rig.robots["panda"], rig.driver("pad")
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
+        (wait,) = player.trajectory.find_waits()
+        rig.clock.sleep(0.1)
+        hand.press("l2")
+        player.approach()
+        hand.release("l2")
+        turns = paused = 0
+
+        def on_turn(player: TrajectoryPlayer, plays: bool) -> None:
+            nonlocal turns, paused
+            turns += 1
+            if turns == 5:
+                hand.press("l2")
+            if player.progress >= wait and not paused:
+                paused = turns
+                hand.release("l2")
+            elif paused and turns == paused + 20:
+                hand.press("l2")
+            assert player.progress < wait + 0.05 or arm.gripper.state().width < 0.02
+            assert turns < 2000
+
+        player.play(on_turn)
+    assert paused
+    assert player.finished
+
+
 @pytest.mark.parametrize("cause", ["pad", "stop", "program"])
 def test_a_trip_ends_it(episode: Recorded, cause: str) -> None:
     with opened("mock", pad=None, overrides=[*BARE, "gamepads.pad.model=auto"]) as rig:
