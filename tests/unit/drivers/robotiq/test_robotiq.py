@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -155,6 +156,106 @@ def test_a_stop_ends_an_activation(far: FarGripper, taken: list[Request]) -> Non
     assert taken[-1].act == 0
 
 
+def go_silent(far: FarGripper) -> None:
+    """Let the driver notice that the line is silent. The fingers wait meanwhile, as until they are back."""
+    far.execute("silent on")
+    with pytest.raises(hal.ConnectionLost):
+        while True:
+            far.driver.read(time.monotonic())
+
+
+def come_back(far: FarGripper) -> None:
+    def read() -> bool:
+        with contextlib.suppress(hal.ConnectionLost):
+            far.driver.read(time.monotonic())
+            return True
+        return False
+
+    far.execute("reset")
+    wait_until(read, "it answers again")
+
+
+def assert_at_rest(far: FarGripper) -> None:
+    at = far.run(0.1).width
+    assert far.run(0.5).width == at
+    assert not far.run(0.01).moving
+
+
+def test_a_reset_on_its_way_is_followed_by_no_activation(far: FarGripper, taken: list[Request]) -> None:
+    far.gripper.switch_on()
+    far.run(0.05)
+    far.execute("late 0.02")
+    far.driver.home()
+    far.driver.stop()
+    far.driver.close()
+    far.execute("reset")
+    far.driver.open()
+    assert_at_rest(far)
+    assert not any(request.act for request in taken)
+
+
+def test_a_stop_ends_an_activation_after_a_motion_was_refused(far: FarGripper) -> None:
+    far.gripper.switch_on()
+    far.driver.home()
+    far.run(0.3)
+    far.driver.move(0.03, 0.1, 60.0)
+    assert far.run(0.05).outcome is GripperOutcome.FAILED
+    far.driver.stop()
+    assert_at_rest(far)
+
+
+def test_a_stop_ends_an_activation_whose_line_was_lost(far: FarGripper) -> None:
+    far.gripper.switch_on()
+    far.driver.home()
+    far.run(0.3)
+    go_silent(far)
+    come_back(far)
+    assert far.run(0.01).moving
+    far.driver.stop()
+    assert_at_rest(far)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_stop_reaches_fingers_whose_line_is_lost(far: FarGripper, before: bool) -> None:
+    far.driver.move(0.0, 0.02, 60.0)
+    far.run(0.2)
+    if before:  # nobody knows of the silence yet
+        far.execute("silent on")
+        far.driver.stop()
+    go_silent(far)
+    if not before:
+        with pytest.raises(hal.ConnectionLost):
+            far.driver.stop()
+    come_back(far)
+    assert_at_rest(far)
+    assert far.gripper.width > 0.05
+
+
+def test_a_command_that_was_lost_fails(far: FarGripper, taken: list[Request]) -> None:
+    far.run(0.05)
+    far.execute("silent on")
+    far.driver.move(0.0, 0.1, 60.0)
+    go_silent(far)
+    come_back(far)
+    reading = far.run(0.05)
+    assert (reading.outcome, reading.moving) == (GripperOutcome.FAILED, False)
+    assert reading.fault is not None
+    assert reading.fault.code == "lost"
+    assert taken == []
+
+
+def test_a_stop_in_every_cycle_does_not_keep_it_from_reading(far: FarGripper) -> None:
+    far.driver.move(0.0, 0.02, 60.0)
+    far.run(0.2)
+    far.execute("late 0.015")
+    seq = far.run(0.05).seq
+    for _ in range(20):
+        far.driver.stop()
+        reading = far.run(0.01)
+    assert reading.seq > seq + 2
+    assert not reading.moving
+
+
 def test_an_activation_that_is_blocked_fails(far: FarGripper) -> None:
     far.gripper.switch_on()
     far.gripper.blocked = True
@@ -204,8 +305,8 @@ def test_a_fault_has_a_name_and_a_remedy(far: FarGripper, code: str, name: str) 
     far.driver.move(0.0, 0.05, 60.0)
     far.run(0.1)
     far.execute(f"fault {code}")
-    reading = far.run(0.05)
-    assert reading.outcome is GripperOutcome.FAILED
+    wait_until(lambda: far.run(0.01).outcome is GripperOutcome.FAILED, "it failed")
+    reading = far.run(0.01)
     assert reading.fault is not None
     assert (reading.fault.code, bool(reading.fault.remedy)) == (name, True)
     far.execute("fault 0")
