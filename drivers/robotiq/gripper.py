@@ -120,7 +120,7 @@ class RobotiqGripper(GripperDriver):
         return {} if status is None else {"count": status.po}
 
     def _poll(self) -> Status:
-        """Return the newest status. Raises ConnectionLost: of what was not taken until then, only a stop is given again."""
+        """Return the newest status. Raises ConnectionLost: of what was not taken, only a stop is given again."""
         if not self._is_open:
             raise ConnectionLost(f"{self.spec.name} is not open", code="closed")
         try:
