@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import threading
 import time
@@ -18,7 +19,7 @@ from waiting import wait_until
 import hal
 from hal.config.loader import load
 from hal.drivers.robotiq.gripper import RobotiqGripper
-from hal.drivers.robotiq.link import Request
+from hal.drivers.robotiq.link import Link, Request, Status
 from hal.drivers.robotiq.settings import is_emulated
 from hal.registry import check_record
 from hal.specs import GripperSpec
@@ -213,6 +214,24 @@ def test_a_stop_ends_an_activation_whose_line_was_lost(far: FarGripper) -> None:
     assert far.run(0.01).moving
     far.driver.stop()
     assert_at_rest(far)
+
+
+def test_what_it_holds_is_never_older_than_its_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    old, new, count = (1, 1, 3, 3, 0, 10, 10), (1, 1, 3, 0, 0, 200, 10), itertools.count()
+
+    def read() -> tuple[int, ...]:
+        status, question = divmod(next(count), 7)  # it takes a target after each of a status' seven questions once
+        return new if question > status else old
+
+    with emulated_robotiq("text", paced=False) as far:
+        monkeypatch.setattr(far.gripper, "read", read)
+        link, seen = Link("gripper", far.driver.settings), set[Status | None]()
+        link.open()
+        while len(seen) < 7:
+            link.poll()
+            seen.add(link.status)
+        link.close()
+    assert {(status.pr, status.obj) for status in seen if status is not None} == {(10, 3), (10, 0), (200, 0)}
 
 
 @pytest.mark.parametrize("before", [True, False])
