@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import itertools
 import os
 import threading
@@ -25,6 +26,8 @@ from hal.registry import check_record
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
+TIOCGEXCL = 0x80045440
+"""Of Linux' asm-generic/ioctls.h; the module termios lacks it."""
 CLOSE = bytes.fromhex("09 10 03E8 0003 06 0900 00FF FFFF 4229")
 CLOSED_ON_AN_OBJECT = bytes.fromhex("09 03 06 B900 00FF BD00 1D7C")
 """Frames of the instruction manual: close at full speed and force, its answer, and a status with gOBJ 2."""
@@ -351,6 +354,16 @@ def test_a_missing_line_is_an_error_with_a_remedy(far: FarGripper) -> None:
         driver = RobotiqGripper(replace(spec, options={"model": "2f85", **options}))
         with pytest.raises(hal.ConnectionLost, match=word):
             driver.open()
+
+
+def test_the_emulated_line_is_free_after_a_close(far: FarGripper) -> None:
+    """For users who are not root, who cannot open a line that is taken."""
+    far.run(0.05)
+    far.driver.close()
+    line = os.open(str(far.driver.settings.port), os.O_RDWR | os.O_NOCTTY)
+    taken = fcntl.ioctl(line, TIOCGEXCL, bytes(4))
+    os.close(line)
+    assert not any(taken)
 
 
 def test_only_an_emulator_counts_as_emulated() -> None:
