@@ -117,6 +117,37 @@ def test_a_camera_comes_back_under_another_number(webcam: FakeWebcam) -> None:
     camera.close()
 
 
+def test_another_camera_in_its_place_is_refused(tmp_path: Path) -> None:
+    with webcams(tmp_path, {"serial": "A1", "port": "1-1"}, {"serial": "B2", "port": "1-2"}) as (first, other):
+        other.unplug()
+        camera = driver()
+        camera.open()
+        first.unplug()
+        other.plug()
+        with pytest.raises(DeviceNotFound, match='was HD Webcam, A1; now there is HD Webcam, serial "B2"') as caught:
+            camera.open()
+        assert caught.value.code == "other_device"
+        other.unplug()
+        first.plug()
+        camera.open()
+        take(camera)
+        camera.close()
+
+
+@pytest.mark.parametrize("offset", [-20.0, 0.5, 1.7e9])
+def test_stamps_of_another_clock_are_replaced(
+    webcam: FakeWebcam, caplog: pytest.LogCaptureFixture, offset: float
+) -> None:
+    webcam.clock_offset = offset
+    camera = driver(rate_hz=60.0)
+    camera.open()
+    before = time.monotonic()
+    frames = take(camera, 3)
+    assert all(before <= frame.t == frame.t_device <= time.monotonic() for frame in frames)
+    assert len(caplog.records) == 1
+    camera.close()
+
+
 def test_the_mode_is_one_that_the_camera_has(webcam: FakeWebcam) -> None:
     for rate, codec in ((60.0, b"YUYV"), (90.0, b"MJPG")):
         camera = driver(rate_hz=rate)
