@@ -66,7 +66,7 @@ class V4l2Camera(CameraDriver):
         found = _choose(self._settings, self.spec.name)
         identity = found.name, found.serial or found.port
         if self._identity not in (None, identity):
-            first = ", ".join(filter(None, self._identity or ()))
+            first = ", ".join(filter(None, self._identity))
             text = f"camera {self.spec.name} was {first}; now there is {found}: plug the first one in where it was"
             raise DeviceNotFound(text, code="other_device")
         try:
