@@ -35,6 +35,7 @@ _FAULTS = {
 """gFLT of the manual. 5 and 7 are those of a gripper that is not activated; 9 is over once it answers."""
 _INACTIVE = Fault("not_activated", "the gripper is not activated, as after its power was off", _ACTIVATE)
 _INTERRUPTED = Fault("lost", "the connection was lost during the activation", _ACTIVATE)
+_LOST = Fault("lost", "the connection was lost before the gripper took the command", "give it again")
 
 
 class RobotiqGripper(GripperDriver):
@@ -63,6 +64,8 @@ class RobotiqGripper(GripperDriver):
         """Whether the gripper has taken the newest request, and when that was sent, s."""
         self._failed: Fault | None = None
         """Why the newest command failed."""
+        self._stopping = False
+        """Whether a stop has yet to reach the gripper."""
         self._seq, self._t_status = 0, 0.0
 
     def open(self) -> None:
@@ -89,6 +92,8 @@ class RobotiqGripper(GripperDriver):
     def read(self, now: float) -> GripperReading:
         offset = now - monotonic()
         status = self._poll()
+        if self._stopping:
+            self.stop()
         if status.t != self._t_status:
             self._seq, self._t_status = self._seq + 1, status.t
         fault = self._find_fault(status)
@@ -115,15 +120,19 @@ class RobotiqGripper(GripperDriver):
         return {} if status is None else {"count": status.po}
 
     def _poll(self) -> Status:
-        """Return the newest status. Raises ConnectionLost: what the gripper has not taken until then is forgotten."""
+        """Return the newest status. Raises ConnectionLost: of what was not taken, only a stop is given again."""
         if not self._is_open:
             raise ConnectionLost(f"{self.spec.name} is not open", code="closed")
         try:
             self._link.poll()
         except ConnectionLost:
-            self._taken = True
             if self._activating:
-                self._activating, self._failed = False, _INTERRUPTED
+                self._failed = _INTERRUPTED
+            elif not self._taken and self._request.gto:
+                self._failed = _LOST
+            elif not self._taken:
+                self._stopping = True
+            self._taken, self._activating = True, False
             raise
         assert self._link.status is not None
         return self._link.status
@@ -144,7 +153,8 @@ class RobotiqGripper(GripperDriver):
                 self._send(Request(1))
             return status.sta != _ACTIVE or not request.act
         if status.sta != _ACTIVE:
-            return False
+            self._taken = True  # what it did not take is not given again after an activation by others
+            return bool(status.act) and status.sta == 1
         self._taken |= status.gto == request.gto and (status.pr == request.pr or not request.gto)
         if not self._taken:
             self._send(request)
@@ -168,6 +178,7 @@ class RobotiqGripper(GripperDriver):
     def move(self, width: float, speed: float, force: float) -> None:
         """Move the fingers to ``width`` (m), or until they meet something, which they then hold."""
         status = self._poll()
+        self._stopping = False
         self._target = min(max(width, 0.0), self.spec.width_max)
         self._activating = False
         self._failed = self._find_fault(status)
@@ -178,21 +189,34 @@ class RobotiqGripper(GripperDriver):
     def home(self) -> None:
         """Activate the gripper, which moves its fingers; one that is active and has no fault stays as it is."""
         self._failed = None
-        if self._find_fault(self._poll()) is not None:
+        status = self._poll()
+        self._stopping = False
+        if self._find_fault(status) is not None:
             self._target, self._activating = None, True
             self._send(Request(0))
 
     def stop(self) -> None:
-        """Stop moving fingers; an activation ends. What is held stays held."""
+        """Stop moving fingers; an activation ends. What is held stays held.
+
+        Raises:
+            ConnectionLost: It does not answer; :meth:`read` stops it once it does.
+        """
+        self._stopping = True
         status = self._poll()
-        if self._activating:
+        self._stopping = False
+        pending = self._link.pending
+        if pending is not None and not pending.act and not self._activating:
+            return  # its reset is on its way; act=1 behind it would activate again
+        if self._activating or (status.act and status.sta == 1):
             self._activating = False
             self._send(Request(0))
         elif self._follow(status):
             self._send(self._request._replace(act=1, gto=0))
 
     def _send(self, request: Request) -> None:
-        self._request = self._link.pending = request
+        self._request = request
+        if self._link.pending != request:  # repeated in every cycle, it would keep the link from reading
+            self._link.pending = request
         self._busy, self._taken, self._t_sent = True, False, monotonic()
 
 

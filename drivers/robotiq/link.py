@@ -141,10 +141,11 @@ class _Text:
         return None
 
     def read(self, t: float) -> Exchange:
-        values = []
-        for name in (b"ACT", b"GTO", b"STA", b"OBJ", b"FLT", b"PRE", b"POS"):
+        values = []  # in this order, so that what the fingers do is never older than their target
+        for name in (b"ACT", b"GTO", b"PRE", b"STA", b"OBJ", b"FLT", b"POS"):
             values.append((yield b"GET %s\n" % name, lambda came, name=name: _find_text(came, name)))  # type: ignore[misc]
-        return Status(t, *map(int, values))
+        act, gto, echo, state, found, fault, position = map(int, values)
+        return Status(t, act, gto, state, found, fault, echo, position)
 
 
 def _find_text(came: bytes, name: bytes) -> bytes | None:

@@ -25,6 +25,8 @@ _LOG = logging.getLogger("hal.webcam")
 _BUFFERS = 4
 _FIRST = 5.0
 """Longest time until the first frame of a camera, s."""
+_OLDEST, _AHEAD = 10.0, 1e-3
+"""Greatest age of a frame that is read, and by how much its stamp may be ahead, s; others are of another clock."""
 _RIGHTS = "no permission to open it; sudo usermod -aG video $USER, then log out and in"
 
 
@@ -45,6 +47,10 @@ class V4l2Camera(CameraDriver):
         self._maps: list[mmap.mmap] = []
         self._heard = self._patience = 0.0
         self._trouble = ""
+        self._identity: tuple[str, str | None] | None = None
+        """Name, and serial number or else port, of the camera that was opened first."""
+        self._misdated = False
+        """Whether stamps of another clock were reported."""
 
     @classmethod
     def list_plugged(cls) -> tuple[str, ...]:
@@ -58,6 +64,11 @@ class V4l2Camera(CameraDriver):
     def open(self) -> None:
         self.close()
         found = _choose(self._settings, self.spec.name)
+        identity = found.name, found.serial or found.port
+        if self._identity not in (None, identity):
+            first = ", ".join(filter(None, self._identity))
+            text = f"camera {self.spec.name} was {first}; now there is {found}: plug the first one in where it was"
+            raise DeviceNotFound(text, code="other_device")
         try:
             self._node = VideoNode(found.path)
             decoder = _set_mode(self._node, self.spec)
@@ -69,7 +80,7 @@ class V4l2Camera(CameraDriver):
         except BaseException:
             self.close()
             raise
-        self._decoder, self._trouble = decoder, ""
+        self._decoder, self._trouble, self._identity = decoder, "", identity
         self._heard, self._patience = time.monotonic(), max(_FIRST, self._settings.stall_s)
         self._info = self._output.describe(
             self.nominal_info(found.name), serial=found.serial, clock=clock, options=MappingProxyType(controls)
@@ -119,7 +130,7 @@ class V4l2Camera(CameraDriver):
             except BlockingIOError:
                 break
             if newest is not None and self._decoder.sequential:
-                self._make_frame(*newest, 0.0)
+                self._make_frame(*newest, time.monotonic())
             newest = buffer, self._maps[buffer.index][: buffer.bytesused]
             node.call(kernel.QUEUE, _make_buffer(buffer.index))
         return newest
@@ -138,6 +149,12 @@ class V4l2Camera(CameraDriver):
         self._heard, self._patience = now, self._settings.stall_s
         stamped = buffer.flags & kernel.CLOCK == kernel.MONOTONIC
         t = buffer.seconds + 1e-6 * buffer.microseconds if stamped else now
+        if not now - _OLDEST < t <= now + _AHEAD:
+            if not self._misdated:
+                why = "its stamps are of another clock, so that frames have the time when they are read"
+                how = "echo CLOCK_MONOTONIC | sudo tee /sys/module/uvcvideo/parameters/clock"
+                _LOG.warning("camera %s: %s; %s", self.spec.name, why, how)
+            self._misdated, t = True, now
         return RawFrame(t, t, buffer.sequence, color=image)
 
     def close(self) -> None:

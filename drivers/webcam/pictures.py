@@ -41,6 +41,8 @@ class PictureDecoder:
             self._bytes = {"nv12": 12, "rgb24": 24, "bgr24": 24}.get(pixels, 16) * width * height // 8
             if pixels not in ("rgb24", "bgr24"):
                 self._how = {"src_colorspace": matrix, "src_color_range": "JPEG" if full else "MPEG"}
+        elif name == "mjpeg":
+            self._codec.options = {"err_detect": "explode"}  # else it guesses what a damaged picture lacks
         elif self.sequential:
             self._codec.thread_count = 1  # several threads would delay each frame
             self._codec.flags |= av.codec.context.Flags.low_delay

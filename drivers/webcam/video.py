@@ -118,12 +118,15 @@ class VideoCamera(CameraDriver):
     def _run(self, container: Any, closing: threading.Event) -> None:
         end = ConnectionLost(f"camera {self.spec.name}: the video is over", code="over")
         end.final = self._settings.file is not None
+        size = self.spec.capture_width, self.spec.capture_height
         try:
             with container:
                 frames = self._play(container, closing) if self._settings.file else self._receive(container)
                 for number, (t, t_device, picture) in enumerate(frames):
                     if closing.is_set():
                         return
+                    if (now := (picture.width, picture.height)) != size:
+                        raise ValueError("its pictures are {}x{} now, not {}x{}".format(*now, *size))
                     with self._news:
                         self._newest = t, t_device, number, picture
                         self._news.notify_all()
@@ -131,7 +134,7 @@ class VideoCamera(CameraDriver):
             end = ConnectionLost(
                 f"camera {self.spec.name} sent nothing for {self._settings.stall_s:g} s", code="stalled"
             )
-        except (av.FFmpegError, OSError, ValueError) as error:
+        except Exception as error:
             end = ConnectionLost(f"camera {self.spec.name}: {error}", code="device_error")
         with self._news:
             if closing is self._closing:
@@ -144,6 +147,8 @@ class VideoCamera(CameraDriver):
         while True:
             first, last = None, 0.0
             for picture in container.decode(video=0):
+                if picture.time is None:
+                    raise ValueError("its frames have no times: put it into a container, ffmpeg -i ... out.mp4")
                 first = picture.time if first is None else first
                 last = played + picture.time - first
                 closing.wait(max(0.0, start + last - time.monotonic()))

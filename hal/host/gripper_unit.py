@@ -34,6 +34,8 @@ class GripperUnit:
         self.spec = driver.spec
         self.mail = mail
         self._reading: GripperReading | None = None
+        self._moving = False
+        """Whether the fingers move; False while the gripper does not answer."""
         self._command: GripperCommand | None = None
         self._force = self.spec.force
         """Force of the newest motion, N."""
@@ -104,9 +106,10 @@ class GripperUnit:
         return is_alive(now, app.t) and command.session in (0, self._allowed_session(now))
 
     def end_motion(self) -> None:
-        """Stop the fingers if they move; they keep what they hold."""
-        if self._outcome is GripperOutcome.RUNNING:
-            self._stop(True)
+        """Stop the fingers if they move, also those whose command has failed; they keep what they hold."""
+        running = self._outcome is GripperOutcome.RUNNING
+        if running or (self._outcome is GripperOutcome.FAILED and self._moving):
+            self._stop(running)
 
     def _take(self, command: GripperCommand) -> None:
         if command.act is GripperAct.STOP:
@@ -153,6 +156,7 @@ class GripperUnit:
     def publish(self, now: float) -> None:
         """Publish the newest state; if the gripper does not answer, an old one with the reason as its fault."""
         lost: Fault | None = None
+        self._moving = False
         try:
             reading = self.driver.read(now)
             if not math.isfinite(reading.width):
@@ -161,7 +165,7 @@ class GripperUnit:
             self._note(error)
             lost = _make_fault(error)
         else:
-            self._reading = reading
+            self._reading, self._moving = reading, reading.moving
             self._judge(reading)
         if self._reading is not None:
             fault = self._fault or lost or self._reading.fault

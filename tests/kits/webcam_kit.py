@@ -57,6 +57,8 @@ class FakeWebcam:
         self.values = {id: control[4] for id, control in CONTROLS.items()}
         self.plugged = self.frozen = False
         self.denied = False
+        self.clock_offset = 0.0
+        """How far its clock is ahead of the monotonic one, s."""
         self.damaged: set[int] = set()
         """Numbers of the frames that arrive damaged."""
         self.streaming: FakeNode | None = None
@@ -188,6 +190,7 @@ class FakeNode:
         if not self.done:
             raise BlockingIOError(errno.EAGAIN, "EAGAIN")
         record.index, record.sequence, t, record.bytesused = self.done.popleft()
+        t += self.camera.clock_offset
         record.seconds, record.microseconds = int(t), int(t % 1.0 * 1e6)
         record.flags = kernel.MONOTONIC | (kernel.DAMAGED if record.sequence in self.camera.damaged else 0)
 

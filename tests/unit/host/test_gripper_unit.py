@@ -240,6 +240,21 @@ def test_a_motion_ends_with_the_app(bench: Bench, session: int) -> None:
     assert [call[0] for call in bench.driver.calls] == ["move", "stop"]
 
 
+def test_fingers_that_move_although_their_command_failed_are_stopped(bench: Bench) -> None:
+    bench.session = bench.allowed = 7
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    assert bench.outcome(moving=True, outcome=GripperOutcome.FAILED) is GripperOutcome.FAILED
+    bench.allowed = 0
+    bench.driver.deaf = ConnectionLost("the cable")
+    bench.turn()
+    bench.turn()
+    bench.driver.deaf = None
+    bench.report()
+    assert bench.outcome(moving=False) is GripperOutcome.FAILED
+    bench.report()
+    assert [call[0] for call in bench.driver.calls] == ["move", "stop", "stop"], "one per cycle in which they moved"
+
+
 def test_a_motion_ends_when_its_session_may_not_move_any_more(bench: Bench) -> None:
     bench.session = bench.allowed = 7
     bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)

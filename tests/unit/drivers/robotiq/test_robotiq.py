@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import itertools
 import os
 import threading
 import time
@@ -17,12 +20,14 @@ from waiting import wait_until
 import hal
 from hal.config.loader import load
 from hal.drivers.robotiq.gripper import RobotiqGripper
-from hal.drivers.robotiq.link import Request
+from hal.drivers.robotiq.link import Link, Request, Status
 from hal.drivers.robotiq.settings import is_emulated
 from hal.registry import check_record
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
+TIOCGEXCL = 0x80045440
+"""Of Linux' asm-generic/ioctls.h; the module termios lacks it."""
 CLOSE = bytes.fromhex("09 10 03E8 0003 06 0900 00FF FFFF 4229")
 CLOSED_ON_AN_OBJECT = bytes.fromhex("09 03 06 B900 00FF BD00 1D7C")
 """Frames of the instruction manual: close at full speed and force, its answer, and a status with gOBJ 2."""
@@ -155,6 +160,124 @@ def test_a_stop_ends_an_activation(far: FarGripper, taken: list[Request]) -> Non
     assert taken[-1].act == 0
 
 
+def go_silent(far: FarGripper) -> None:
+    """Let the driver notice that the line is silent. The fingers wait meanwhile, as until they are back."""
+    far.execute("silent on")
+    with pytest.raises(hal.ConnectionLost):
+        while True:
+            far.driver.read(time.monotonic())
+
+
+def come_back(far: FarGripper) -> None:
+    def read() -> bool:
+        with contextlib.suppress(hal.ConnectionLost):
+            far.driver.read(time.monotonic())
+            return True
+        return False
+
+    far.execute("reset")
+    wait_until(read, "it answers again")
+
+
+def assert_at_rest(far: FarGripper) -> None:
+    at = far.run(0.1).width
+    assert far.run(0.5).width == at
+    assert not far.run(0.01).moving
+
+
+def test_a_reset_on_its_way_is_followed_by_no_activation(far: FarGripper, taken: list[Request]) -> None:
+    far.gripper.switch_on()
+    far.run(0.05)
+    far.execute("late 0.02")
+    far.driver.home()
+    far.driver.stop()
+    far.driver.close()
+    far.execute("reset")
+    far.driver.open()
+    assert_at_rest(far)
+    assert not any(request.act for request in taken)
+
+
+def test_a_stop_ends_an_activation_after_a_motion_was_refused(far: FarGripper) -> None:
+    far.gripper.switch_on()
+    far.driver.home()
+    far.run(0.3)
+    far.driver.move(0.03, 0.1, 60.0)
+    assert far.run(0.05).outcome is GripperOutcome.FAILED
+    far.driver.stop()
+    assert_at_rest(far)
+
+
+def test_a_stop_ends_an_activation_whose_line_was_lost(far: FarGripper) -> None:
+    far.gripper.switch_on()
+    far.driver.home()
+    far.run(0.3)
+    go_silent(far)
+    come_back(far)
+    assert far.run(0.01).moving
+    far.driver.stop()
+    assert_at_rest(far)
+
+
+def test_what_it_holds_is_never_older_than_its_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    old, new, count = (1, 1, 3, 3, 0, 10, 10), (1, 1, 3, 0, 0, 200, 10), itertools.count()
+
+    def read() -> tuple[int, ...]:
+        status, question = divmod(next(count), 7)  # it takes a target after each of a status' seven questions once
+        return new if question > status else old
+
+    with emulated_robotiq("text", paced=False) as far:
+        monkeypatch.setattr(far.gripper, "read", read)
+        link, seen = Link("gripper", far.driver.settings), set[Status | None]()
+        link.open()
+        while len(seen) < 7:
+            link.poll()
+            seen.add(link.status)
+        link.close()
+    assert {(status.pr, status.obj) for status in seen if status is not None} == {(10, 3), (10, 0), (200, 0)}
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_stop_reaches_fingers_whose_line_is_lost(far: FarGripper, before: bool) -> None:
+    far.driver.move(0.0, 0.02, 60.0)
+    far.run(0.2)
+    if before:  # nobody knows of the silence yet
+        far.execute("silent on")
+        far.driver.stop()
+    go_silent(far)
+    if not before:
+        with pytest.raises(hal.ConnectionLost):
+            far.driver.stop()
+    come_back(far)
+    assert_at_rest(far)
+    assert far.gripper.width > 0.05
+
+
+def test_a_command_that_was_lost_fails(far: FarGripper, taken: list[Request]) -> None:
+    far.run(0.05)
+    far.execute("silent on")
+    far.driver.move(0.0, 0.1, 60.0)
+    go_silent(far)
+    come_back(far)
+    reading = far.run(0.05)
+    assert (reading.outcome, reading.moving) == (GripperOutcome.FAILED, False)
+    assert reading.fault is not None
+    assert reading.fault.code == "lost"
+    assert taken == []
+
+
+def test_a_stop_in_every_cycle_does_not_keep_it_from_reading(far: FarGripper) -> None:
+    far.driver.move(0.0, 0.02, 60.0)
+    far.run(0.2)
+    far.execute("late 0.015")
+    seq = far.run(0.05).seq
+    for _ in range(20):
+        far.driver.stop()
+        reading = far.run(0.01)
+    assert reading.seq > seq + 2
+    assert not reading.moving
+
+
 def test_an_activation_that_is_blocked_fails(far: FarGripper) -> None:
     far.gripper.switch_on()
     far.gripper.blocked = True
@@ -204,8 +327,8 @@ def test_a_fault_has_a_name_and_a_remedy(far: FarGripper, code: str, name: str) 
     far.driver.move(0.0, 0.05, 60.0)
     far.run(0.1)
     far.execute(f"fault {code}")
-    reading = far.run(0.05)
-    assert reading.outcome is GripperOutcome.FAILED
+    wait_until(lambda: far.run(0.01).outcome is GripperOutcome.FAILED, "it failed")
+    reading = far.run(0.01)
     assert reading.fault is not None
     assert (reading.fault.code, bool(reading.fault.remedy)) == (name, True)
     far.execute("fault 0")
@@ -231,6 +354,16 @@ def test_a_missing_line_is_an_error_with_a_remedy(far: FarGripper) -> None:
         driver = RobotiqGripper(replace(spec, options={"model": "2f85", **options}))
         with pytest.raises(hal.ConnectionLost, match=word):
             driver.open()
+
+
+def test_the_emulated_line_is_free_after_a_close(far: FarGripper) -> None:
+    """For users who are not root, who cannot open a line that is taken."""
+    far.run(0.05)
+    far.driver.close()
+    line = os.open(str(far.driver.settings.port), os.O_RDWR | os.O_NOCTTY)
+    taken = fcntl.ioctl(line, TIOCGEXCL, bytes(4))
+    os.close(line)
+    assert not any(taken)
 
 
 def test_only_an_emulator_counts_as_emulated() -> None:

@@ -6,6 +6,7 @@ import ctypes
 import itertools
 import time
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 pytest.importorskip("av", reason="needs PyAV: pip install 'robot-hal[record]'")
 
 import av
+from PIL import Image
 from webcam_kit import AUTOGAIN, BRIGHTNESS, GAIN, FakeWebcam, grey, webcams
 
 from hal.camera import Camera
@@ -24,6 +26,7 @@ from hal.driver import RawFrame
 from hal.drivers.webcam import kernel
 from hal.drivers.webcam.capture import V4l2Camera, preflight
 from hal.drivers.webcam.pictures import PictureDecoder
+from hal.drivers.webcam.video import VideoCamera
 from hal.errors import ConfigError, ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
 from hal.images import distort_points
 from hal.testing import camera_spec
@@ -117,6 +120,37 @@ def test_a_camera_comes_back_under_another_number(webcam: FakeWebcam) -> None:
     camera.close()
 
 
+def test_another_camera_in_its_place_is_refused(tmp_path: Path) -> None:
+    with webcams(tmp_path, {"serial": "A1", "port": "1-1"}, {"serial": "B2", "port": "1-2"}) as (first, other):
+        other.unplug()
+        camera = driver()
+        camera.open()
+        first.unplug()
+        other.plug()
+        with pytest.raises(DeviceNotFound, match='was HD Webcam, A1; now there is HD Webcam, serial "B2"') as caught:
+            camera.open()
+        assert caught.value.code == "other_device"
+        other.unplug()
+        first.plug()
+        camera.open()
+        take(camera)
+        camera.close()
+
+
+@pytest.mark.parametrize("offset", [-20.0, 0.5, 1.7e9])
+def test_stamps_of_another_clock_are_replaced(
+    webcam: FakeWebcam, caplog: pytest.LogCaptureFixture, offset: float
+) -> None:
+    webcam.clock_offset = offset
+    camera = driver(rate_hz=60.0)
+    camera.open()
+    before = time.monotonic()
+    frames = take(camera, 3)
+    assert all(before <= frame.t == frame.t_device <= time.monotonic() for frame in frames)
+    assert len(caplog.records) == 1
+    camera.close()
+
+
 def test_the_mode_is_one_that_the_camera_has(webcam: FakeWebcam) -> None:
     for rate, codec in ((60.0, b"YUYV"), (90.0, b"MJPG")):
         camera = driver(rate_hz=rate)
@@ -176,6 +210,48 @@ def test_each_compressed_frame_is_decoded_at_once(codec: str) -> None:
     if codec == "mjpeg":
         with pytest.raises(ValueError, match="cut off"):
             decoder.decode(bytes(packet)[:-20])
+
+
+def make_jpeg(width: int, height: int) -> bytes:
+    file = BytesIO()
+    values = np.random.default_rng(0).integers(0, 255, (height // 8, width // 8, 3), np.uint8)
+    Image.fromarray(values).resize((width, height)).save(file, "JPEG")
+    return file.getvalue()
+
+
+def test_a_jpeg_that_is_damaged_in_the_middle_is_refused() -> None:
+    decoder, good = PictureDecoder("mjpeg", 640, 480), make_jpeg(640, 480)
+    part = len(good) // 3
+    for middle in (b"", bytes(part)):
+        decoder.decode(good + bytes(64))
+        with pytest.raises(ValueError, match="frame"):
+            decoder.decode(good[:part] + middle + good[2 * part :])
+    at = good.index(b"\xff\xc4")
+    while good[at : at + 2] == b"\xff\xc4":  # many cameras leave out the usual Huffman tables
+        good = good[:at] + good[at + 2 + int.from_bytes(good[at + 2 : at + 4], "big") :]
+    decoder.decode(good)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "why"),
+    [
+        ("sizes.mjpeg", make_jpeg(64, 48) + make_jpeg(128, 96), "128x96 now, not 64x48"),
+        ("raw.h264", None, "its frames have no times"),
+    ],
+)
+def test_a_video_that_cannot_be_played_says_why(tmp_path: Path, name: str, data: bytes | None, why: str) -> None:
+    if data is None:
+        context = av.CodecContext.create("libx264", "w")
+        context.width, context.height, context.framerate, context.pix_fmt = 64, 48, 25, "yuv420p"
+        frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+        data = b"".join(map(bytes, [*context.encode(frame), *context.encode()]))
+    (tmp_path / name).write_bytes(data)
+    options = {"file": str(tmp_path / name)}
+    camera = VideoCamera(camera_spec(driver="video", streams=("color",), rate_hz=25.0, options=options))
+    camera.open()
+    with pytest.raises(ConnectionLost, match=why):
+        take(camera, 3)
+    camera.close()
 
 
 def test_colours_have_the_cameras_range_and_matrix() -> None:

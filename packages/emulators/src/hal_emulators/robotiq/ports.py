@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import random
 import re
 import socket
 import struct
+import termios
 import tty
 from pathlib import Path
 from time import monotonic
@@ -108,6 +110,10 @@ class SerialPort(Port):
 
     def descriptors(self) -> list[int]:
         return list(self._ends[:1])
+
+    def serve(self, descriptor: int) -> bool:
+        fcntl.ioctl(self._ends[1], termios.TIOCNXCL)  # as a driver's close would, were the end not open here too
+        return super().serve(descriptor)
 
     def answer(self, came: bytes) -> tuple[bytes, bytes]:
         answers = b""
