@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from waiting import wait_until
 
 import hal
 from hal.config.data_files import find_data
@@ -37,6 +38,7 @@ class Lab:
 
     def _read(self) -> None:
         for line in self.process.stdout:
+            print(line, end="")
             self.lines.put(line)
 
     def wait_line(self, wanted: Callable[[str], bool]) -> str:
@@ -75,12 +77,14 @@ def config(tmp_path: Path) -> Path:
 def lab(config: Path) -> Iterator[Lab]:
     """The laboratory, ready."""
     lab = Lab(config)
-    ready = set()
-    while ready != {"arm", "robotiq", "can"}:
-        ready.add(lab.wait_line(lambda line: "ready:" in line).partition(":")[0])
-    yield lab
-    lab.process.kill()
-    lab.process.wait(10.0)
+    try:
+        ready = set()
+        while ready != {"arm", "robotiq", "can"}:
+            ready.add(lab.wait_line(lambda line: "ready:" in line).partition(":")[0])
+        yield lab
+    finally:
+        lab.process.kill()
+        lab.process.wait(10.0)
 
 
 def grasp_cube(config: Path, sim: bool) -> tuple[bool, float, float]:
@@ -100,6 +104,7 @@ def grasp_cube(config: Path, sim: bool) -> tuple[bool, float, float]:
 
 
 @pytest.mark.alone
+@pytest.mark.timeout(300)
 def test_one_program_grasps_in_simulation_and_in_the_laboratory_and_a_typed_fault_stops_it(
     lab: Lab, config: Path
 ) -> None:
@@ -111,9 +116,11 @@ def test_one_program_grasps_in_simulation_and_in_the_laboratory_and_a_typed_faul
     lab.type("middle help")
     assert "arm, robotiq, can" in lab.wait_line(lambda line: "begin with the name" in line)
     with hal.open(config, sim=False, pad="none") as rig:
+        arm = rig.robots["arm"]
         lab.type("arm protective")
-        with pytest.raises(hal.HalError, match="protective stop"):
-            rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
+        wait_until(lambda: arm.state().fault is not None, "the stop is known")
+        with pytest.raises(hal.RobotFault, match="protective stop"):
+            arm.move_to(arm.home, unattended=True)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from hal.errors import HalError
-from hal_emulators.control import CONTROL_PORT
+from hal_emulators.control import CONTROL_PORT, EmulatorControl, serve_prompt
 from hal_emulators.shared_world import enter_world
 
 from .controller import Controller
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="hal emulate ur",
         description="Emulates the controller of a Universal Robots arm for ur_rtde. What UR does not publish is "
         "assumed; it proves nothing about a real arm.",
-        epilog="commands of the control port, for example `echo protective | nc HOST 1339`:\n" + help_text(),
+        epilog="commands, typed here or sent to the control port:\n" + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
@@ -75,6 +75,7 @@ def _serve(options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
         f"control {options.host}:{CONTROL_PORT}",
         flush=True,
     )
+    serve_prompt(stack.enter_context(EmulatorControl(options.host)).send)
     server.run()
 
 
