@@ -35,7 +35,7 @@ from hal.recording import Recorder
 with hal.open(rig, sim=sim, clock=clock, pad="none", engine="mujoco") as opened, Recorder(opened, out) as recorder:
     arm = opened.robots["panda"]
     recorder.start()
-    arm.move_to(arm.home + 0.05)
+    arm.move_to(arm.home + 0.15)
     recorder.save(True)
 """
 
