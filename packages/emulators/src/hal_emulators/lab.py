@@ -133,7 +133,7 @@ def _end_all(processes: Sequence[subprocess.Popen[str]]) -> None:
 
 def _print_lines(name: str, process: subprocess.Popen[str]) -> None:
     for line in process.stdout or ():
-        print(f"{name}: {line.rstrip()}", flush=True)
+        print(f"{name}: {line.rstrip()}\n", end="", flush=True)  # in one piece: others print, too
 
 
 def _serve_prompt(running: dict[str, subprocess.Popen[str]]) -> None:
