@@ -303,6 +303,15 @@ def test_a_stop_of_fingers_that_hold_writes_nothing(far: FarGripper, taken: list
     assert far.gripper.force == pytest.approx(100.0, abs=1.0)
 
 
+def test_close_stops_moving_fingers(far: FarGripper) -> None:
+    far.driver.move(0.0, 0.02, 60.0)
+    far.run(0.2)
+    far.driver.close()
+    at = far.gripper.width
+    far.emulator.advance(0.25)
+    assert 0.05 < at == far.gripper.width
+
+
 def test_a_lost_object_is_no_grasp(far: FarGripper) -> None:
     far.execute("object 0.03")
     far.driver.move(0.0, 0.1, 100.0)
