@@ -352,6 +352,7 @@ def test_the_line_is_checked_before_it_is_opened() -> None:
 
     assert problems(port="/dev/ttyUSB0") == problems(host="192.168.0.2") == set()
     assert problems() == problems(port="/dev/ttyUSB0", host="192.168.0.2") == {"real.port"}
+    assert problems(host="192.168.0.2:63352") == {"real.host"}
     assert problems(port="a", slave=0) == {"real.slave"}
     assert problems(port="a", counts=[200, 100]) == {"real.counts"}
     assert problems(port="a", model="3f") == {"real.model"}
@@ -378,6 +379,7 @@ def test_the_emulated_line_is_free_after_a_close(far: FarGripper) -> None:
 def test_only_an_emulator_counts_as_emulated() -> None:
     assert is_emulated({"port": "/tmp/robotiq.emulated"})
     assert is_emulated({"host": "127.0.0.2"})
+    assert is_emulated({"host": "localhost."})
     assert not is_emulated({"port": "/dev/pts/3"}), "a pseudo terminal may lead to a real one"
     assert not is_emulated({"host": "192.168.0.2"})
     assert load("franka_robotiq", sim=False, overrides=robotiq_overrides()).resolve().robots[0].emulated
