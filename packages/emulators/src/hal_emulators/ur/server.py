@@ -138,7 +138,7 @@ class UrServer:
         self._late: deque[tuple[float, _Client, bytes]] = deque()
         self._lose = self._delay = 0.0
         self._silent_until = self._cut_until = 0.0
-        self._running, self._cycle = True, 0
+        self._running, self._cycle, self._lost = True, 0, 0
         self._listeners: list[socket.socket] = []
         self._control = self._listen(CONTROL_PORT)
         self._listen_all()
@@ -309,6 +309,7 @@ class UrServer:
             if not client.started or client.output is None or self._cycle % client.every:
                 continue
             if self._lose and self._random.random() < self._lose:
+                self._lost += 1
                 continue
             state = state or self.controller.read_state()
             data = b"\1" + client.output.pack(state)
@@ -376,6 +377,7 @@ class UrServer:
             "payload": controller.payload,
             "tcp": controller.tcp,
             "events": controller.events,
+            "lost": self._lost,
             "now": controller.now,
         }
 
