@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import random
 import re
 import selectors
@@ -19,15 +18,13 @@ from collections.abc import Callable
 from typing import Any
 
 from hal_emulators.control import CONTROL_PORT
-from hal_emulators.shared_world import ArmInWorld
+from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .controller import POWER_OFF, RUNNING, Controller
 
 __all__ = ["COMMANDS", "UrServer"]
 
 RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
-_PRIORITY = 40
-"""Of this process among SCHED_FIFO ones; a host has 50."""
 _LONGEST = 1 << 20
 """Most bytes that a client may send without a whole message."""
 _FORMATS = {"VECTOR6D": "6d", "DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q"}
@@ -154,8 +151,7 @@ class UrServer:
 
     def run(self) -> None:
         """Serve until :meth:`stop` is called."""
-        with contextlib.suppress(AttributeError, OSError):  # Linux only, and only where it is allowed
-            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+        raise_priority(PRIORITY)
         due = time.monotonic()
         while self._running:
             due += self.controller.dt
