@@ -72,7 +72,7 @@ def serve_prompt(execute: Execute) -> None:
         with contextlib.suppress(OSError, ValueError):
             for line in sys.stdin:
                 if line.strip():
-                    answer = _answer(execute, line)
+                    answer = answer_line(execute, line)
                     report = {key: value for key, value in answer.items() if key != "ok"}
                     print(
                         answer.get("text") or answer.get("error") or (json.dumps(report) if report else "ok"),
@@ -105,15 +105,23 @@ class CommandPort:
     def _serve(self, connection: socket.socket) -> None:
         with contextlib.suppress(OSError), connection, connection.makefile("r", encoding="utf-8") as lines:
             for line in lines:
-                connection.sendall(json.dumps(_answer(self._execute, line)).encode() + b"\n")
+                connection.sendall(json.dumps(answer_line(self._execute, line)).encode() + b"\n")
 
     def close(self) -> None:
         """Close the port."""
         self._listener.close()
 
 
-def _answer(execute: Execute, line: str) -> dict[str, Any]:
+def answer_line(execute: Execute, line: str) -> dict[str, Any]:
+    """Execute a line, and return its answer with ``ok``, and ``error`` where that is false."""
     try:
         return {"ok": True, **execute(line)}
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, IndexError) as error:
         return {"ok": False, "error": str(error)}
+
+
+def read_switch(word: str) -> bool:
+    """Return whether a word is on. Raises ValueError unless it is on or off."""
+    if word not in ("on", "off"):
+        raise ValueError(f"takes on or off, not {word!r}")
+    return word == "on"

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from hal.config.loader import load
 from hal.specs import GripperSpec
+from hal_emulators.control import read_switch
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .gripper import EmulatedGripper
@@ -201,7 +202,7 @@ COMMANDS = {
     "block": _Command(
         "block on|off",
         "hold the fingers, so that an activation fails",
-        lambda port, words: setattr(port.gripper, "blocked", words[0] == "on"),
+        lambda port, words: setattr(port.gripper, "blocked", read_switch(words[0])),
     ),
     "power": _Command("power [S|on|off]", "switch its power off for 0.5 s, for S, for good, or on again", _power),
     "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", _end)),

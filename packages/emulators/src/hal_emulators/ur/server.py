@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from hal_emulators.control import CONTROL_PORT
+from hal_emulators.control import CONTROL_PORT, answer_line, read_switch
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .controller import POWER_OFF, RUNNING, Controller
@@ -114,6 +114,8 @@ class _Client:
 
 class UrServer:
     """The controller's ports on one address.
+
+    The control port is one of them: a ``CommandPort``'s threads would change the controller within a cycle.
 
     Args:
         host: Address to listen on.
@@ -231,13 +233,10 @@ class UrServer:
 
     def _answer(self, client: _Client, line: str) -> None:
         if client.port == DASHBOARD:
-            self._send(client, self.controller.answer_dashboard(line.lower()).encode() + b"\n")
-            return
-        try:
-            answer = {"ok": True, **self.execute(line.split())}
-        except (ValueError, IndexError) as error:
-            answer = {"ok": False, "error": str(error) or "help lists the commands"}
-        self._send(client, json.dumps(answer).encode() + b"\n")
+            answer = self.controller.answer_dashboard(line.lower())
+        else:
+            answer = json.dumps(answer_line(self.execute, line))
+        self._send(client, answer.encode() + b"\n")
 
     def _take_script(self, client: _Client) -> None:
         """Run a script once its last line has come."""
@@ -317,9 +316,9 @@ class UrServer:
 
     # Faults.
 
-    def execute(self, words: list[str]) -> dict[str, Any]:
-        """Execute a command of :data:`COMMANDS`. Raises ValueError and IndexError for a wrong one."""
-        name, *values = words
+    def execute(self, line: str) -> dict[str, Any]:
+        """Execute a command of :data:`COMMANDS`. Raises ValueError for a wrong one."""
+        name, *values = line.split() or [""]
         if name not in COMMANDS:
             raise ValueError(f"there is no command {name!r}; help lists them")
         if name == "help":
@@ -329,10 +328,10 @@ class UrServer:
         controller = self.controller
         act: dict[str, Callable[[], object]] = {
             "protective": lambda: controller.stop_protective("C153: requested here"),
-            "estop": lambda: controller.stop_emergency(_switch(values[0])),
-            "safeguard": lambda: controller.set_safeguard(_switch(values[0])),
-            "power": lambda: controller.set_power(RUNNING if _switch(values[0]) else POWER_OFF),
-            "remote": lambda: controller.set_remote(_switch(values[0])),
+            "estop": lambda: controller.stop_emergency(read_switch(values[0])),
+            "safeguard": lambda: controller.set_safeguard(read_switch(values[0])),
+            "power": lambda: controller.set_power(RUNNING if read_switch(values[0]) else POWER_OFF),
+            "remote": lambda: controller.set_remote(read_switch(values[0])),
             "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
             "jog": lambda: controller.jog(int(_number(values[0], 0, 5)), _number(values[1], -3.0, 3.0)),
             "program": lambda: (
@@ -344,7 +343,10 @@ class UrServer:
             "cut": lambda: self._cut(_number(values[0], 0.0, 1e9)),
             "refresh": self._refresh,
         }
-        act[name]()
+        try:
+            act[name]()
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"{error}; usage: {name} {COMMANDS[name][0]}".rstrip()) from None
         return {}
 
     def _cut(self, seconds: float) -> None:
@@ -388,9 +390,3 @@ def _number(word: str, least: float, most: float) -> float:
     if not least <= value <= most:
         raise ValueError(f"must be {least:g} to {most:g}, not {word}")
     return value
-
-
-def _switch(word: str) -> bool:
-    if word not in ("on", "off"):
-        raise ValueError(f"takes on or off, not {word!r}")
-    return word == "on"
