@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
+import signal
 import socket
 import sys
 import threading
@@ -12,6 +14,30 @@ from typing import Any
 
 CONTROL_PORT = 1339
 """TCP port of a Franka's emulator; that of emulated buses is a free one, which it prints."""
+
+
+def add_rig_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of an emulator that plays every device of its kind in a rig."""
+    parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
+    parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
+    parser.add_argument(
+        "--no-world",
+        action="store_true",
+        help="leave out the rig's simulated world: the fingers meet only what the command `object` names",
+    )
+
+
+def note_signals() -> list[int]:
+    """Return a list to which the signals that ask this program to end are appended.
+
+    It is no Event: a second signal within its ``set`` would wait for ever.
+    """
+    ends: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _: ends.append(number))
+    return ends
 
 
 class EmulatorControl:
@@ -125,3 +151,14 @@ def read_switch(word: str) -> bool:
     if word not in ("on", "off"):
         raise ValueError(f"takes on or off, not {word!r}")
     return word == "on"
+
+
+def read_words(line: str) -> list[str]:
+    """Return the words of a line, which may also be ``{"command": [WORD, ...]}``. Raises ValueError."""
+    if not line.startswith("{"):
+        return line.split()
+    message = json.loads(line)
+    words = message.get("command")
+    if not isinstance(words, list) or not words:
+        raise ValueError('expected {"command": ["word", ...]}')
+    return [str(word) for word in words]

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from hal.drivers.franka.flags import flag_index
-from hal_emulators.control import CONTROL_PORT, answer_line, read_switch
+from hal_emulators.control import CONTROL_PORT, answer_line, read_switch, read_words
 
 from .faults import COMMANDS, help_text
 from .journal import Counters
@@ -44,7 +44,7 @@ class CommandConsole:
     def __init__(self, host: str, poller: select.epoll, execute: Execute) -> None:
         """Raises OSError if the port is in use."""
         self._poller = poller
-        self._execute = lambda line: execute(_words(line))
+        self._execute = lambda line: execute(read_words(line))
         self._listener = listen(host, CONTROL_PORT)
         self._connections: dict[int, socket.socket] = {}
         self._unfinished: dict[int, bytes] = {}
@@ -106,16 +106,6 @@ class CommandConsole:
         """Close the port."""
         for connection in (self._listener, *self._connections.values()):
             connection.close()
-
-
-def _words(line: str) -> list[str]:
-    if not line.startswith("{"):
-        return line.split()
-    message = json.loads(line)
-    words = message.get("command")
-    if not isinstance(words, list) or not words:
-        raise ValueError('expected {"command": ["word", ...]}')
-    return [str(word) for word in words]
 
 
 def _readable_stdin() -> int | None:

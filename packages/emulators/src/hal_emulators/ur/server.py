@@ -14,7 +14,7 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hal_emulators.control import CONTROL_PORT, answer_line, read_switch
@@ -137,7 +137,7 @@ class UrServer:
         self._late: deque[tuple[float, _Client, bytes]] = deque()
         self._lose = self._delay = 0.0
         self._silent_until = self._cut_until = 0.0
-        self._running, self._cycle, self._lost = True, 0, 0
+        self._cycle = self._lost = 0
         self._listeners: list[socket.socket] = []
         self._control = self._listen(CONTROL_PORT)
         self._listen_all()
@@ -151,11 +151,11 @@ class UrServer:
     def _listen_all(self) -> None:
         self._listeners = [self._listen(port) for port in (RTDE, DASHBOARD, *SCRIPTS)]
 
-    def run(self) -> None:
-        """Serve until :meth:`stop` is called."""
+    def run(self, ends: Sequence[object]) -> None:
+        """Serve until something is in ``ends``."""
         raise_priority(PRIORITY)
         due = time.monotonic()
-        while self._running:
+        while not ends:
             due += self.controller.dt
             self._serve(max(0.0, due - time.monotonic()))
             if time.monotonic() - due > 0.1:  # a computer that slept: time is not made up for
@@ -164,10 +164,6 @@ class UrServer:
             if self.world is not None:
                 self.world.exchange(self.controller.dt, self.controller.motion.q)
             self._publish()
-
-    def stop(self) -> None:
-        """End :meth:`run`; may be called by a signal's handler."""
-        self._running = False
 
     def close(self) -> None:
         """Close all sockets."""
