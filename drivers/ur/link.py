@@ -7,12 +7,11 @@ ports have answered. Its other calls release the lock. Its objects are never del
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import dashboard_client
@@ -20,7 +19,7 @@ import rtde_control
 import rtde_receive
 
 from hal.errors import ConnectionLost, Fault
-from hal.host.scheduling import PRIORITY
+from hal.host.scheduling import share_priority
 from hal.lock import DeviceLock
 
 from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN, STOPPED
@@ -71,21 +70,6 @@ def probe(host: str, timeout: float = 1.0) -> str:
         except OSError as error:
             return f"port {port} of {host}: {error.strerror or error}"
     return ""
-
-
-@contextlib.contextmanager
-def share_priority() -> Iterator[None]:
-    """Give the threads that are created meanwhile, ur_rtde's too, a priority below the servo's, where permitted."""
-    try:
-        before = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY - 1))
-    except (AttributeError, OSError):  # Linux only, and only where it is allowed
-        yield
-        return
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, *before)
 
 
 class UrLink:

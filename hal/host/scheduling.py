@@ -10,6 +10,7 @@ import platform
 import signal
 import struct
 import sys
+from collections.abc import Iterator
 
 from ..preflight import may_lock_memory
 
@@ -52,6 +53,21 @@ def prepare_process(realtime: bool) -> None:
         _shorten_slice()
     if may_lock_memory():
         libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)  # without the last, a new thread takes ms
+
+
+@contextlib.contextmanager
+def share_priority() -> Iterator[None]:
+    """Give the threads that are created meanwhile a priority below the servo's, where that is allowed."""
+    try:
+        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY - 1))
+    except (AttributeError, OSError):  # Linux only, and only where it is allowed
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)
 
 
 def is_realtime() -> bool:
