@@ -25,7 +25,7 @@ from hal.errors import ConnectionLost, Fault
 from hal.host.scheduling import share_priority
 from hal.lock import DeviceLock
 
-from .faults import NO_CONTROLLER, NOT_STARTED, SERVO, describe_warning, error_fault
+from .faults import NO_CONTROLLER, NOT_STARTED, POSITION, SERVO, describe_warning, error_fault
 from .settings import XArmSettings
 
 __all__ = ["COMMANDS", "REPORTS", "PERIOD", "Report", "ReportLine", "XArmLink", "connect", "lock_arm", "probe"]
@@ -38,6 +38,8 @@ _REPORT = struct.Struct("<BH20f")
 _LONGEST_REPORT = 4096
 _POLL = 0.05
 """Time between two questions for errors while no set-points are sent, s."""
+_WATCH = 0.5
+"""The same while they are, s."""
 _STALL = 0.012
 """Longest time that a set-point waits to be sent, s: one that is older would be a step."""
 _TIMEOUT = 0.5
@@ -366,7 +368,7 @@ class XArmLink:
         self.longest_answer = max(self.longest_answer, time.monotonic() - began)
         if code == _NOT_READY:
             self.refused_setpoint = True
-        elif code == _ERROR:
+        elif code == _ERROR or began - self.t_errors > _WATCH:  # the SDK does not say of a warning
             self._ask()
 
     def _ask(self) -> None:
@@ -387,7 +389,8 @@ class XArmLink:
                 return
             self.sent, self.refused_setpoint, self.longest_answer = None, False, 0.0
             codes = [api.motion_enable(True)]
-            if load is not None:
+            if load is not None:  # the controller takes it as it takes a motion
+                codes += [api.set_mode(POSITION), api.set_state(0)]
                 codes.append(api.set_tcp_load(load.mass, [1e3 * x for x in load.com]))
             codes += [api.set_mode(SERVO), api.set_state(0)]
             self.ready, self.t_ready = not any(codes), time.monotonic()

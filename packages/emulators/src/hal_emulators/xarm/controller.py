@@ -32,6 +32,10 @@ _SHORTEST, _LONGEST = 0.004, 0.02
 """A set-point counts as coming this long after the one before, s."""
 
 
+_BEYOND = math.radians(0.1)
+"""How far set-points may be beyond a limit, rad, as in the SDK."""
+
+
 class Robot(NamedTuple):
     """An arm."""
 
@@ -208,7 +212,7 @@ class Controller:
         return True
 
     def _is_inside(self, q: Sequence[float]) -> bool:
-        return all(low <= x <= high for x, (low, high) in zip(q, self.arm.limits, strict=True))
+        return all(low - _BEYOND <= x <= high + _BEYOND for x, (low, high) in zip(q, self.arm.limits, strict=True))
 
     # Each cycle.
 

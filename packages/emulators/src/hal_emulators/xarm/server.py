@@ -206,7 +206,7 @@ class XArmServer:
             16: c.clean_error,
             17: lambda: setattr(c, "warning", 0),
             19: lambda: c.set_mode(data[0]),
-            36: lambda: setattr(c, "load", list(struct.unpack_from("<4f", data))),
+            36: lambda: c.ready and setattr(c, "load", list(struct.unpack_from("<4f", data))),
         }
         if register in act:
             act[register]()
