@@ -137,17 +137,15 @@ class XArm(RobotDriver):
         return ConnectionLost.of(self.spec.name, SILENT)
 
     def _take(self, now: float, reports: list[Report]) -> None:
-        """Take the newest of the reports that have just come; speeds are differences of two reports."""
+        """Take the newest of the reports that have just come; speeds are differences of what they report."""
         n, last = self._n, self._last
         self._seq += len(reports)
         self._report = report = reports[-1]
         q = report.q[:n]
         dq: Floats = (0.0,) * n
-        if len(reports) > 1:
-            dq = [(b - a) / PERIOD for a, b in zip(reports[-2].q[:n], q, strict=True)]
-        elif last is not None and not self._lost:
-            dt = max(PERIOD, PERIOD * round((now - last.t) / PERIOD))  # reports come when the network lets them
-            dq = [(b - a) / dt for a, b in zip(last.q, q, strict=True)]
+        if last is not None and not self._lost:
+            periods = max(len(reports), round((now - last.t) / PERIOD))  # several may come at once, or one be left out
+            dq = [(b - a) / (PERIOD * periods) for a, b in zip(last.q, q, strict=True)]
         self._t_new = now
         self._last = Reading(now, self._seq * PERIOD, self._seq, q, dq, report.tau[:n])
 
