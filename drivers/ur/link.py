@@ -19,7 +19,7 @@ import rtde_control
 import rtde_receive
 
 from hal.errors import ConnectionLost, Fault
-from hal.host.scheduling import share_priority
+from hal.host.scheduling import note_threads
 from hal.lock import DeviceLock
 
 from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN, STOPPED
@@ -123,7 +123,7 @@ class UrLink:
         why = probe(host)
         if why:
             raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
-        with share_priority():
+        with note_threads():
             self._connect(host)
 
     def _connect(self, host: str) -> None:
@@ -266,10 +266,7 @@ class UrLink:
                 target, self._target = self._target, None
                 ending = time.monotonic() < self._end_by  # that comes first, and is tried again
                 jobs, self._jobs = ([], self._jobs) if ending else (self._jobs, [])
-            gap = time.monotonic() - last
-            if gap > 0.7 / WATCHDOG_HZ:
-                self.t_late = time.monotonic()
-            self.longest_gap = max(self.longest_gap, gap)
+            self._note_gap(time.monotonic() - last)
             try:
                 if not receive.isConnected() or not control.isConnected():
                     self.lose()
@@ -287,12 +284,21 @@ class UrLink:
                 self.lose()
             last = time.monotonic()
         with contextlib.suppress(RuntimeError):
-            if time.monotonic() < self._end_by and control.isConnected():
-                self._end_program()
-            if self._ours and control.isConnected():
-                control.stopScript()
-            control.disconnect()
-            receive.disconnect()
+            self._disconnect(receive, control)
+
+    def _disconnect(self, receive: Any, control: Any) -> None:
+        if time.monotonic() < self._end_by and control.isConnected():
+            self._end_program()
+        if self._ours and control.isConnected():
+            control.stopScript()
+        control.disconnect()
+        receive.disconnect()
+
+    def _note_gap(self, gap: float) -> None:
+        """Note the time since the last message, s."""
+        if gap > 0.7 / WATCHDOG_HZ:
+            self.t_late = time.monotonic()
+        self.longest_gap = max(self.longest_gap, gap)
 
     def _serve(self, control: Any, target: list[float] | None) -> None:
         if target is None:

@@ -22,7 +22,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints its version
     from xarm.wrapper import XArmAPI
 
 from hal.errors import ConnectionLost, Fault
-from hal.host.scheduling import share_priority
+from hal.host.scheduling import note_threads
 from hal.lock import DeviceLock
 
 from .faults import NO_CONTROLLER, NOT_STARTED, POSITION, SERVO, describe_warning, error_fault
@@ -208,9 +208,10 @@ class XArmLink:
         if not why:
             self._ended, self._jobs = threading.Event(), []
             self._thread = threading.Thread(target=self._run, args=[self._ended], name=f"xarm-{self.name}", daemon=True)
-            with share_priority():
+            with note_threads():
                 self._thread.start()
-            if not self._finish(lambda: None, _CONNECT):
+                connected = self._finish(lambda: None, _CONNECT)
+            if not connected:
                 why = f"port {COMMANDS} of {host}: the SDK does not connect"
         if why:
             raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
