@@ -1,7 +1,7 @@
 """Driver of a UFACTORY arm: the servo's set-points go to ``set_servo_angle_j``, states come from port 30003.
 
-* ``engage`` switches the motors on and sets servo mode (mode 1); ``halt`` leaves the arm at its last set-point, where it
-  stands. ``open`` does neither: it works while another program moves the arm.
+* ``engage`` switches the motors on and sets servo mode (mode 1); ``halt`` leaves the arm at its last set-point.
+  ``open`` does neither: it works while another program moves the arm.
 * In servo mode the controller executes each set-point at once, and keeps the last one. So silence stops the arm.
 * What stops the arm, or takes it over, is a fault until ``recover``, which clears the controller's error.
 """
@@ -86,7 +86,9 @@ class XArm(RobotDriver):
             self.close()
             if isinstance(error, ConnectionLost):
                 raise
-            raise ConnectionLost(f"{self.spec.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code) from error
+            raise ConnectionLost(
+                f"{self.spec.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code
+            ) from error
         except BaseException:
             self.close()
             raise

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from xarm.core.config.x_config import XCONF
 
 from hal.errors import ControlTaken, Fault
 from hal.geometry import Pose
@@ -23,6 +24,8 @@ from .settings import XArmSettings
 
 _FAR, _TURNED = 0.001, 0.005
 """Difference of two tcps that is named, m and rad."""
+_NARROWER = 1e-3
+"""By how much a limit of the model may be beyond the controller's, rad."""
 _LATE = 2.5
 """Periods without a report from which one is late."""
 _FIRST = 1.0
@@ -54,6 +57,7 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
             return
         yield CheckResult("controller", "ok", found)
         yield from _check_state(api, report)
+        yield check_limits(spec, api.axis, api.device_type, api.sn)
         yield _check_tcp(spec, report)
         yield _check_payload(settings, api)
         yield _check_reports(line, duration)
@@ -85,8 +89,28 @@ def _check_state(api: Any, report: Report) -> Iterator[CheckResult]:
         yield CheckResult("state", "ok", f"no error; motors {'on' if on else 'off, until a session opens'}")
 
 
+def check_limits(spec: RobotSpec, axis: int, kind: int, serial: str | None) -> CheckResult:
+    """Compare the model's joint limits with those that the SDK has for this arm, by its type and serial number."""
+    digits = (serial or "")[2:6]
+    newer = digits.isdigit() and 1305 <= int(digits) < 8500  # as the SDK decides it
+    known = XCONF.Robot.JOINT_LIMITS.get(axis, {}).get(int(f"{axis}1305") if newer else kind)
+    if known is None:
+        return CheckResult("limits", "unknown", f"the SDK has none for type {kind}", "compare them with the manual")
+    wider = [
+        f"{joint} {least:.3f} to {most:.3f} rad"
+        for joint, low, high, (least, most) in zip(
+            spec.joints, spec.limits.lower, spec.limits.upper, known, strict=False
+        )
+        if low < least - _NARROWER or high > most + _NARROWER
+    ]
+    if not wider:
+        return CheckResult("limits", "ok", "those of the model are within the controller's")
+    remedy = "set them under limits: of the arm in the rig; beyond them the controller stops with C23"
+    return CheckResult("limits", "warn", f"narrower than the model's are: {', '.join(wider)}", remedy)
+
+
 def _check_tcp(spec: RobotSpec, report: Report) -> CheckResult:
-    """Compare the controller's tcp with the model's: they differ by the tcp that is set there, and by the calibration."""
+    """Compare the controller's tcp with the model's: they differ by the tcp set there, and by the calibration."""
     position, (roll, pitch, yaw) = [1e-3 * x for x in report.pose[:3]], report.pose[3:]
     theirs = Pose.from_rpy(position, (roll, pitch, yaw))
     distance, turn = theirs.distance(Kinematics(spec.kinematics).pose(report.q[: len(spec.joints)]))
@@ -122,4 +146,4 @@ def _check_reports(line: ReportLine, duration: float) -> CheckResult:
     found = f"{len(times)} reports, longest gap {1e3 * gaps.max():.1f} ms, {late} late"
     if late <= len(times) // 100:
         return CheckResult("reports", "ok", found)
-    return CheckResult("reports", "warn", found, "connect the cable directly, end busy programs, use a real-time kernel")
+    return CheckResult("reports", "warn", found, "connect the cable directly, end busy programs")

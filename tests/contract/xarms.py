@@ -37,11 +37,15 @@ class XArm7:
                 real_time=True,
                 lose=lambda: control.send("cut 1000") and None,
                 restore=lambda: control.send("cut 0") and None,
-                fail=lambda: control.send("error 31") and "" or "collision",
+                fail=self._collide,
             )
         finally:
             control.send("refresh")
             driver.close()
+
+    def _collide(self) -> str:
+        self.emulator.control.send("error 31")
+        return "collision"
 
     def close(self) -> None:
         self.emulator.close()

@@ -50,6 +50,18 @@ def test_the_models_flange_is_where_the_dh_parameters_of_ufactory_put_it() -> No
         assert turn < 1e-4
 
 
+def test_narrower_limits_of_a_newer_arm_are_named() -> None:
+    pytest.importorskip("xarm", reason="needs xarm-python-sdk: pip install 'robot-hal[xarm]'")
+    from hal.drivers.xarm.preflight import check_limits
+
+    spec = load_xarm7()
+    assert check_limits(spec, 7, 7, "XI130412345678").level == "ok"
+    newer = check_limits(spec, 7, 7, "XI130512345678")
+    assert newer.level == "warn"
+    assert "joint2 -2.042 to 2.025 rad, joint4 -0.105 to 3.927 rad" in newer.found
+    assert check_limits(spec, 7, 99, None).level == "unknown"
+
+
 def test_the_models_limits_are_those_of_the_sdk() -> None:
     limits = load_xarm7().limits
     for low, high, (least, most) in zip(limits.lower, limits.upper, ROBOTS["xarm7"].limits, strict=True):

@@ -1,7 +1,7 @@
 """Emulated UFACTORY controller: modes, states, errors, and the arm.
 
-Registers, states and errors are those that xarm-python-sdk 1.18.4 names. UFACTORY publishes that servo mode executes the
-newest set-point at once, and stops above 180 degrees/s and 1 m/s; how it measures speeds is chosen here.
+Registers, states and errors are those that xarm-python-sdk 1.18.4 names. UFACTORY publishes that servo mode executes
+the newest set-point at once, and stops above 180 degrees/s and 1 m/s; how it measures speeds is chosen here.
 """
 
 from __future__ import annotations
@@ -96,6 +96,8 @@ class Controller:
         """Mass, kg, and its centre, mm."""
         self.blind = False
         """Whether the first joint is reported as not a number."""
+        self.blocked = False
+        """Whether something holds the joints."""
         self.events: list[str] = []
         """What happened, the newest last."""
         self.set_points = 0
@@ -221,7 +223,7 @@ class Controller:
         self.now += DT
         if self._goal is not None:
             self._plan()
-        share, most = 1.0 - math.exp(-DT / _LAG), math.pi * DT
+        share, most = 0.0 if self.blocked else 1.0 - math.exp(-DT / _LAG), math.pi * DT
         steps = [min(max(share * (b - a), -most), most) for a, b in zip(self.q, self.target, strict=True)]
         self.q = [a + step for a, step in zip(self.q, steps, strict=True)]
         self.dq = [step / DT for step in steps]
