@@ -98,12 +98,17 @@ def test_an_answer_that_is_late_stops_the_arm_and_no_set_point_jumps(rig: hal.Ri
 
 
 def test_an_arm_that_is_held_back_is_stopped(rig: hal.Rig, emulator: XArmEmulator) -> None:
-    drive(rig, emulator, "block on", "NOT_FOLLOWING", speed=0.3)
+    arm = rig.robots["arm"]
+    arm.move_to(arm.home, unattended=True, speed=0.3)
+    emulator.control.send("block on")
+    with pytest.raises(hal.RobotFault, match="not where its set-points are"):
+        arm.move_to(arm.home + [0, 0, 0, 0, 0, 0, 1.5], unattended=True, speed=0.3)
+    wait_code(arm, "NOT_FOLLOWING")
     stopped = emulator.wait_for(lambda status: status["state"] == 4)
     emulator.control.send("block off")
     time.sleep(0.2)
     assert emulator.status()["q"] == pytest.approx(stopped["q"], abs=1e-3), "nothing moves once it is free"
-    recover(rig, rig.robots["arm"])
+    recover(rig, arm)
 
 
 def test_a_controller_that_answers_no_commands_is_lost(rig: hal.Rig, emulator: XArmEmulator) -> None:

@@ -136,6 +136,16 @@ class Controller:
             self.mode = mode
             self._halt(CHANGED)
 
+    def take_over(self, mode: int) -> None:
+        """Be used by another program, in a mode."""
+        self.set_mode(mode)
+        self.set_state(0)
+
+    def set_load(self, load: Sequence[float]) -> None:
+        """Set mass, kg, and its centre, mm; only while it takes motions, as whose it counts."""
+        if self.ready:
+            self.load = list(load)
+
     def set_state(self, state: int) -> None:
         """Let it take commands (0), pause (3) or stop (4, 6)."""
         if state in (PAUSED, STOPPED, 6):

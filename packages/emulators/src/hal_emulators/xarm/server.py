@@ -207,7 +207,7 @@ class XArmServer:
             16: c.clean_error,
             17: lambda: setattr(c, "warning", 0),
             19: lambda: c.set_mode(data[0]),
-            36: lambda: c.ready and setattr(c, "load", list(struct.unpack_from("<4f", data))),
+            36: lambda: c.set_load(struct.unpack_from("<4f", data)),
         }
         if register in act:
             act[register]()
@@ -278,7 +278,7 @@ class XArmServer:
             "warn": lambda: setattr(c, "warning", int(_number(values[0], 0, 255))),
             "estop": lambda: c.press(read_switch(values[0])),
             "state": lambda: c.set_state(int(_number(values[0], 0, 6))),
-            "mode": lambda: (c.set_mode(int(_number(values[0], 0, 11))), c.set_state(0)),
+            "mode": lambda: c.take_over(int(_number(values[0], 0, 11))),
             "power": lambda: c.enable(read_switch(values[0])),
             "jog": lambda: c.jog(int(_number(values[0], 0, c.axes - 1)), _number(values[1], -3.0, 3.0)),
             "block": lambda: setattr(c, "blocked", read_switch(values[0])),
