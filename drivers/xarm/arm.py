@@ -17,6 +17,7 @@ from hal.errors import ConnectionLost, Fault, RobotFault
 from hal.specs import RobotSpec
 
 from .faults import (
+    BUSY,
     NO_CONTROLLER,
     NOT_FOLLOWING,
     OTHER_MODE,
@@ -43,6 +44,8 @@ _EXPLAIN = 0.08
 """Longest time to find out why the arm stopped, s."""
 _LAG, _APART = 0.1, 0.06
 """Time by which the arm may follow its set-points later, s, and a distance, rad: chosen."""
+_SETTLING = 0.3
+"""Time that an arm which was stopped takes to come to rest, s."""
 _STARTED = 0.3
 """Time after the motors were switched on within which the reports must say so, s."""
 _AT_REST = 0.02
@@ -69,7 +72,7 @@ class XArm(RobotDriver):
         self._last: Reading | None = None
         self._report: Report | None = None
         self._seq = 0
-        self._t_new = self._t_read = self._t_tried = -inf
+        self._t_new = self._t_read = self._t_tried = self._t_ours = -inf
         self._t_trouble = inf
         """Since when the arm is not ready for set-points, s."""
         self._held_back = -1
@@ -123,6 +126,7 @@ class XArm(RobotDriver):
         if silent or now - link.silent_since > _NO_ANSWER or not link.connected or self._last is None:
             raise self._lose()
         self._lost = False
+        self._t_ours = now if self.engaged else self._t_ours
         fault = self._judge(now)
         # Reports are of 100 Hz and have no set-point: while they are sent, the last one that was sent is reported.
         taken = link.sent if self.engaged else None
@@ -161,6 +165,8 @@ class XArm(RobotDriver):
         begins = not link.starting and time.monotonic() - link.t_ready > _STARTED
         if fault is None and begins:
             fault = find_occupant(report.mode, report.state, max(map(abs, last.dq)) > _AT_REST)
+            if fault is BUSY and self._t_read - self._t_ours < _SETTLING:
+                return  # what moves is the end of our own motion
         if fault is not None:
             link.refused = None
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)

@@ -18,7 +18,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints its version
-    from xarm.core.utils.log import logger
+    from xarm.core.utils.log import logger, origin_logger
     from xarm.wrapper import XArmAPI
 
 from hal.errors import ConnectionLost, Fault
@@ -50,7 +50,7 @@ _ANSWER = 2.0
 """Longest time that a caller waits for the thread, s."""
 _RETRY = 0.5
 """Time between attempts to connect again, s."""
-_OK, _ERROR, _NOT_READY = 0, 1, 9
+_OK, _ERROR = 0, 1
 _UNANSWERED = (-1, 3, 8)
 """What the SDK's calls return: not connected, too late, not sent."""
 
@@ -79,7 +79,8 @@ def probe(host: str, timeout: float = 1.0) -> str:
 
 def connect(host: str, **options: Any) -> XArmAPI:
     """Return the SDK's connection to a control box that :func:`probe` found. Raises OSError."""
-    logger.setLevel(logging.CRITICAL)  # it would print at every call; what matters is a fault
+    for log in (logger, origin_logger):  # they would print at every call; what matters is a fault
+        log.setLevel(logging.CRITICAL)
     default = socket.getdefaulttimeout()
     api = XArmAPI(host, is_radian=True, do_not_open=True, check_joint_limit=False, timed_comm=False, **options)
     try:
@@ -177,7 +178,6 @@ class XArmLink:
         """Whether the motors were switched on and the mode was set."""
         self.t_ready = -inf
         """When they were, s."""
-        self.starting = False
         self.refused: Fault | None = None
         """Why the motors were not switched on."""
         self.sent: list[float] | None = None
@@ -187,13 +187,17 @@ class XArmLink:
         self.longest_answer = 0.0
         """Longest time until a set-point was answered since the motors were switched on, s."""
         self.refused_setpoint = False
-        """Whether the controller refused a set-point, as not being ready."""
+        """Whether the controller refused a set-point."""
         self.connected = False
         self._api: Any = None
+        self._axis = 0
+        """Number of joints of the controller's arm."""
         self._wake = threading.Condition()
         self._jobs: list[Callable[[], None]] = []
         self._target: list[float] | None = None
         self._t_target = 0.0
+        self._asked: object = None
+        """Stands for the start that is under way; None for none."""
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
         self._lock: DeviceLock | None = None
@@ -215,9 +219,9 @@ class XArmLink:
                 why = f"port {COMMANDS} of {host}: the SDK does not connect"
         if why:
             raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
-        if self._api.axis != self.joints:
+        if self._axis != self.joints:
             raise ConnectionLost(
-                f"{self.name}: the controller at {host} has an arm with {self._api.axis} joints, the model has "
+                f"{self.name}: the controller at {host} has an arm with {self._axis} joints, the model has "
                 f"{self.joints}; choose the arm's model, or check real.host",
                 code="WRONG_ARM",
             )
@@ -241,8 +245,14 @@ class XArmLink:
 
     def start(self) -> None:
         """Switch the motors on soon: then ``ready`` is True, or ``refused`` says why not."""
-        self.starting, self.ready, self.refused = True, False, None
-        self._call(self._start)
+        asked = self._asked = object()
+        self.ready, self.refused = False, None
+        self._call(lambda: self._start(asked))
+
+    @property
+    def starting(self) -> bool:
+        """Whether the motors are being switched on."""
+        return self._asked is not None
 
     def stop(self) -> None:
         """Stop the arm soon."""
@@ -260,7 +270,8 @@ class XArmLink:
 
     def clean(self) -> bool:
         """Clear error and warning; return whether the controller answered. Blocks for at most 2 s."""
-        return self._finish(self._clean, _ANSWER)
+        began = time.monotonic()
+        return self._finish(self._clean, _ANSWER) and self.t_errors >= began
 
     def forgive(self, now: float) -> None:
         """Count a silence from ``now`` (s) on: this process did not run until then."""
@@ -269,8 +280,8 @@ class XArmLink:
 
     def lose(self) -> None:
         """Note that the controller is silent: what it does is no longer known."""
+        self._asked = None
         self.end()
-        self.starting = False
 
     def close(self) -> None:
         """Stop the arm if it was ours, and disconnect. Idempotent."""
@@ -280,7 +291,7 @@ class XArmLink:
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join(4.0)
-        self.connected = self.starting = False
+        self.connected, self._asked = False, None
         if self._lock is not None:
             self._lock.release()
             self._lock = None
@@ -327,7 +338,11 @@ class XArmLink:
         if probe(self.settings.host):
             ended.wait(_RETRY)
             return
-        self._api = connect(self.settings.host, enable_report=False)
+        api = connect(self.settings.host, enable_report=False)
+        if ended.is_set():  # given up meanwhile: another thread may be connected
+            api.disconnect()
+            return
+        self._api, self._axis = api, int(api.axis)
         self._ask()
         self.connected = True
 
@@ -367,9 +382,9 @@ class XArmLink:
         began = time.monotonic()
         code = self._timed(self._api.set_servo_angle_j, q)
         self.longest_answer = max(self.longest_answer, time.monotonic() - began)
-        if code == _NOT_READY:
+        if code not in (_OK, *_UNANSWERED):
             self.refused_setpoint = True
-        elif code == _ERROR or began - self.t_errors > _WATCH:  # the SDK does not say of a warning
+        if code == _ERROR or began - self.t_errors > _WATCH:  # the SDK does not tell of a warning
             self._ask()
 
     def _ask(self) -> None:
@@ -381,23 +396,31 @@ class XArmLink:
             if self.warning not in (0, before):
                 print(f"{self.name}: warning of the controller: {describe_warning(self.warning)}", file=sys.stderr)
 
-    def _start(self) -> None:
-        api, load = self._api, self.settings.load
+    def _start(self, asked: object) -> None:
+        if asked is not self._asked:  # the connection was lost meanwhile
+            return
+        refused: Fault | None = NOT_STARTED
         try:
-            self._ask()
-            if self.error:
-                self.refused = error_fault(self.error)
-                return
-            self.sent, self.refused_setpoint, self.longest_answer = None, False, 0.0
-            codes = [api.motion_enable(True)]
-            if load is not None:  # the controller takes it as it takes a motion
-                codes += [api.set_mode(POSITION), api.set_state(0)]
-                codes.append(api.set_tcp_load(load.mass, [1e3 * x for x in load.com]))
-            codes += [api.set_mode(SERVO), api.set_state(0)]
-            self.ready, self.t_ready = not any(codes), time.monotonic()
-            self.refused = None if self.ready else NOT_STARTED
+            refused = self._start_motors()
         finally:
-            self.starting = False
+            with self._wake:
+                if asked is self._asked:
+                    self.ready, self.t_ready = refused is None, time.monotonic()
+                    self.refused, self._asked = refused, None
+
+    def _start_motors(self) -> Fault | None:
+        """Switch the motors on and set servo mode; return why that was not possible."""
+        api, load = self._api, self.settings.load
+        self._ask()
+        if self.error:
+            return error_fault(self.error)
+        self.sent, self.refused_setpoint, self.longest_answer = None, False, 0.0
+        codes = [api.motion_enable(True)]
+        if load is not None:  # the controller takes it as it takes a motion
+            codes += [api.set_mode(POSITION), api.set_state(0)]
+            codes.append(api.set_tcp_load(load.mass, [1e3 * x for x in load.com]))
+        codes += [api.set_mode(SERVO), api.set_state(0)]
+        return NOT_STARTED if any(codes) else None
 
     def _stop(self) -> None:
         self._timed(self._api.set_state, 4)
