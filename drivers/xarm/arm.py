@@ -12,23 +12,11 @@ import time
 from math import inf
 from typing import Any
 
-from hal.driver import Floats, Reading, RobotDriver, Setpoint
+from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import ConnectionLost, Fault, RobotFault
 from hal.specs import RobotSpec
 
-from .faults import (
-    BUSY,
-    NO_CONTROLLER,
-    NOT_FOLLOWING,
-    OTHER_MODE,
-    PAUSE,
-    PAUSED,
-    SERVO,
-    SILENT,
-    STOP,
-    error_fault,
-    find_occupant,
-)
+from . import faults
 from .link import PERIOD, Report, ReportLine, XArmLink
 from .settings import XArmSettings
 
@@ -61,7 +49,7 @@ class XArm(RobotDriver):
         self.engaged = False
         self._n = len(spec.joints)
         self._link = XArmLink(spec.name, self.settings, self._n)
-        self._reports = ReportLine(self.settings.host)
+        self._reports = ReportLine(spec.name, self.settings.host)
         self._farthest = max(spec.limits.velocity) * _LAG + _APART
         self._clear()
 
@@ -84,14 +72,8 @@ class XArm(RobotDriver):
         self._clear()
         try:
             self._link.open()
-            self._take(time.monotonic(), [self._reports.open()])
-        except OSError as error:
-            self.close()
-            if isinstance(error, ConnectionLost):
-                raise
-            raise ConnectionLost(
-                f"{self.spec.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code
-            ) from error
+            first = self._reports.open()
+            self._take(time.monotonic(), first)
         except BaseException:
             self.close()
             raise
@@ -140,45 +122,44 @@ class XArm(RobotDriver):
     def _lose(self) -> ConnectionLost:
         self._lost, self.engaged = True, False
         self._link.lose()
-        return ConnectionLost.of(self.spec.name, SILENT)
+        return ConnectionLost.of(self.spec.name, faults.SILENT)
 
     def _take(self, now: float, reports: list[Report]) -> None:
         """Take the newest of the reports that have just come; speeds are differences of what they report."""
         n, last = self._n, self._last
         self._seq += len(reports)
         self._report = report = reports[-1]
-        q = report.q[:n]
-        dq: Floats = (0.0,) * n
-        if last is not None and not self._lost:
-            periods = max(len(reports), round((now - last.t) / PERIOD))  # several may come at once, or one be left out
-            dq = [(b - a) / (PERIOD * periods) for a, b in zip(last.q, q, strict=True)]
+        before, periods = reports[0].q, len(reports) - 1
+        if last is not None:  # several reports may come at once, and some may be left out
+            before, periods = last.q, max(len(reports), round((now - last.t) / PERIOD))
+        dq = [(b - a) / (PERIOD * periods) for a, b in zip(before, report.q, strict=False)][:n]
         self._t_new = now
-        self._last = Reading(now, self._seq * PERIOD, self._seq, q, dq, report.tau[:n])
+        self._last = Reading(now, self._seq * PERIOD, self._seq, report.q[:n], dq, report.tau[:n])
 
     def engage(self) -> None:
         """Switch the motors on and set servo mode, or continue to: the arm holds."""
         self._check_open()
         link, report, last = self._link, self._report, self._last
         if report is None or last is None or self._lost:
-            raise ConnectionLost.of(self.spec.name, SILENT)
+            raise ConnectionLost.of(self.spec.name, faults.SILENT)
         fault = self._fault or last.fault or link.refused
         begins = not link.starting and time.monotonic() - link.t_ready > _STARTED
         if fault is None and begins:
-            fault = find_occupant(report.mode, report.state, max(map(abs, last.dq)) > _AT_REST)
-            if fault is BUSY and self._t_read - self._t_ours < _SETTLING:
+            fault = faults.find_occupant(report.mode, report.state, max(map(abs, last.dq)) > _AT_REST)
+            if fault is faults.BUSY and self._t_read - self._t_ours < _SETTLING:
                 return  # what moves is the end of our own motion
         if fault is not None:
             link.refused = None
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
         if begins:
             link.start()
-        elif link.ready and report.mode == SERVO and report.state < PAUSED:
+        elif link.ready and report.takes_setpoints:
             self.engaged, self._t_trouble = True, inf
 
     def write(self, setpoint: Setpoint) -> bool:
         self._check_open()
         if self._lost or self._last is None:
-            raise ConnectionLost.of(self.spec.name, SILENT)
+            raise ConnectionLost.of(self.spec.name, faults.SILENT)
         if self._fault is not None or self._held_back == self._seq:
             return False
         if self._link.send(list(setpoint.q)):
@@ -197,12 +178,12 @@ class XArm(RobotDriver):
     def _judge(self, now: float) -> Fault | None:
         """Return the present fault; one of a session stays until recover()."""
         link = self._link
-        fault = error_fault(link.error) if link.error else None
+        fault = faults.error_fault(link.error) if link.error else None
         if self.engaged:
             fault = fault or self._judge_session(now)
             if fault is not None:
                 self._fault, self.engaged = fault, False
-                (link.stop if fault in (NOT_FOLLOWING, PAUSE) else link.end)()
+                (link.stop if fault in (faults.NOT_FOLLOWING, faults.PAUSE) else link.end)()
         return fault or self._fault
 
     def _judge_session(self, now: float) -> Fault | None:
@@ -213,17 +194,20 @@ class XArm(RobotDriver):
         link, report, last = self._link, self._report, self._last
         assert report is not None
         assert last is not None
-        if report.mode == SERVO and report.state < PAUSED and not link.refused_setpoint:
+        if report.takes_setpoints and not link.refused_setpoint:
             self._t_trouble = inf
             sent = link.sent
             off = 0.0 if sent is None else max(abs(a - b) for a, b in zip(sent, last.q, strict=True))
-            return NOT_FOLLOWING if off > self._farthest else None
+            return faults.NOT_FOLLOWING if off > self._farthest else None
         if self._t_trouble == inf:
             self._t_trouble = now
             link.ask()
-        if link.t_errors < self._t_trouble and now - self._t_trouble < _EXPLAIN:
+        known = min(link.t_errors, self._t_new) > self._t_trouble  # a refused set-point is known before its reason
+        if not known and now - self._t_trouble < _EXPLAIN:
             return None
-        return OTHER_MODE if report.mode != SERVO else PAUSE if report.state == PAUSED else STOP
+        if report.mode != faults.SERVO:
+            return faults.OTHER_MODE
+        return faults.PAUSE if report.state == faults.PAUSED else faults.STOP
 
     def recover(self) -> None:
         """Clear the controller's error and warning. The next session switches the motors on. Blocks for at most 2 s.
@@ -234,8 +218,8 @@ class XArm(RobotDriver):
         """
         self._check_open()
         if self._lost or not self._link.clean():
-            raise ConnectionLost.of(self.spec.name, SILENT)
+            raise ConnectionLost.of(self.spec.name, faults.SILENT)
         self._fault, self._t_trouble = None, inf
         if self._link.error:
-            fault = error_fault(self._link.error)
+            fault = faults.error_fault(self._link.error)
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)

@@ -1,11 +1,10 @@
-"""Faults of a UFACTORY arm, with cause and remedy.
-
-Numbers and causes of errors and warnings: xarm-python-sdk 1.18.4, xarm/core/config/x_code.py.
-"""
+"""Faults of a UFACTORY arm, with cause and remedy."""
 
 from __future__ import annotations
 
 from hal.errors import Fault
+
+from .sdk import ControllerErrorCodeMap, ControllerWarnCodeMap
 
 POSITION, SERVO, MANUAL = 0, 1, 2
 """Modes: position control, servo motion, joint teaching (the arm is moved by hand)."""
@@ -13,62 +12,39 @@ MOVING, READY, PAUSED, STOPPED, CHANGED = 1, 2, 3, 4, 5
 """States: in motion; at rest, takes commands; paused; stopped; its mode or its settings were changed."""
 
 _PATH = "look where the arm is, and slow down or plan another path"
-_SUPPORT = "restart the control box with its emergency stop; if that does not help, ask UFACTORY"
 _BOUNDARY = "move the arm back by hand (UFACTORY Studio, Live Control, Manual Mode)"
-
+_MOTOR = "restart the control box with its emergency stop; if that does not help, ask UFACTORY"
 _ERRORS = {
     1: ("the emergency stop of the control box is pressed", "release the button"),
     2: ("the emergency input of the control box is open", "close both EI inputs"),
     3: ("the emergency stop of the three-state switch is pressed", "release the button"),
-    10: ("a servo motor has an error", _SUPPORT),
-    **{10 + k: (f"the motor of joint {k} has an error", _SUPPORT) for k in range(1, 8)},
-    18: ("the force sensor does not answer", "check that it is installed, or disable it"),
-    19: ("the end effector does not answer", "check its plug and its baud rate"),
-    21: ("the controller found no solution for a pose", _PATH),
+    10: ("a motor has an error", _MOTOR),
+    **{10 + k: (f"the motor of joint {k} has an error", _MOTOR) for k in range(1, 8)},
     22: ("the arm is about to collide with itself", _PATH),
     23: ("a joint is beyond its limit", _BOUNDARY),
     24: ("the speed exceeds the controller's limit: 180 degrees/s of a joint, 1 m/s of the tcp", _PATH),
-    25: ("the controller could not plan the motion", _PATH),
-    26: ("the controller was too late (Linux RT)", _SUPPORT),
-    27: ("a motor did not answer a command", _SUPPORT),
-    28: ("the module at the end of the arm does not answer", _SUPPORT),
-    30: ("the measured speed exceeds its limit", _SUPPORT),
     31: (
         "collision: the motors' currents are not as expected",
         "look for the cause, clear the way; check the payload (real.load), and the collision sensitivity",
     ),
-    33: ("an input or output of the controller has an error", "check its wiring, then restart the control box"),
     35: ("the arm is at the safety boundary of the controller", _BOUNDARY),
-    37: ("the arm moved unexpectedly in manual mode", "check the payload and the mounting of the arm"),
-    38: ("a joint's angle is abnormal", _SUPPORT),
-    39: ("the power board does not answer", _SUPPORT),
-    40: ("the controller found no solution for a joint motion", _PATH),
-    41: ("the file of the joints' friction is not valid", _SUPPORT),
-    42: ("the file of the calibration is not valid", _SUPPORT),
-    **{50 + k: ("the force sensor has an error", "unload it, and check its cable") for k in range(4)},
     60: ("the linear speed exceeds the limit of servo mode", _PATH),
-    110: ("the base board of the arm does not answer", _SUPPORT),
-    111: ("a device on the RS-485 of the control box does not answer", "check its plug and its baud rate"),
 }
-
-_WARNINGS = {
-    11: "its buffer of commands is full",
-    12: "a command had a wrong parameter",
-    13: "a command is not known",
-    14: "a command has no solution",
-    15: "its buffer of Modbus commands is full",
-}
+_LOOK_UP = "look it up in UFACTORY Studio"
 
 
 def error_fault(number: int) -> Fault:
-    """Return the fault of an error of the controller, ``C`` and its number."""
-    cause, remedy = _ERRORS.get(number, ("an error that this driver does not know", "look it up in UFACTORY Studio"))
+    """Return the fault of an error of the controller, ``C`` and its number; of most the words are the SDK's."""
+    known = ControllerErrorCodeMap.get(number, {}).get("en", {})
+    theirs = known.get("title", "an error that the SDK does not know"), known.get("desc") or _LOOK_UP
+    cause, remedy = _ERRORS.get(number, theirs)
     return Fault(f"C{number}", f"{cause} (error {number})", remedy)
 
 
 def describe_warning(number: int) -> str:
     """Return the meaning of a warning of the controller, which stops nothing."""
-    return f"W{number}: {_WARNINGS.get(number, 'a warning that this driver does not know')}"
+    known = ControllerWarnCodeMap.get(number, {}).get("en", {})
+    return f"W{number}: {known.get('title', 'a warning that the SDK does not know')}"
 
 
 STOP = Fault(

@@ -17,15 +17,12 @@ from collections.abc import Callable
 from math import inf
 from typing import Any, NamedTuple
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints its version
-    from xarm.core.utils.log import logger, origin_logger
-    from xarm.wrapper import XArmAPI
-
 from hal.errors import ConnectionLost, Fault
 from hal.host.scheduling import note_threads
 from hal.lock import DeviceLock
 
-from .faults import NO_CONTROLLER, NOT_STARTED, POSITION, SERVO, describe_warning, error_fault
+from .faults import NO_CONTROLLER, NOT_STARTED, PAUSED, POSITION, SERVO, describe_warning, error_fault
+from .sdk import XArmAPI, logger, origin_logger
 from .settings import XArmSettings
 
 __all__ = ["COMMANDS", "REPORTS", "PERIOD", "Report", "ReportLine", "XArmLink", "connect", "lock_arm", "probe"]
@@ -77,6 +74,11 @@ def probe(host: str, timeout: float = 1.0) -> str:
     return ""
 
 
+def no_controller(name: str, why: str) -> ConnectionLost:
+    """Return the error of an arm ``name`` that cannot be reached."""
+    return ConnectionLost(f"{name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
+
+
 def connect(host: str, **options: Any) -> XArmAPI:
     """Return the SDK's connection to a control box that :func:`probe` found. Raises OSError."""
     for log in (logger, origin_logger):  # they would print at every call; what matters is a fault
@@ -106,27 +108,37 @@ class Report(NamedTuple):
     tau: tuple[float, ...]
     """7 torques that the controller estimates, Nm."""
 
+    @property
+    def takes_setpoints(self) -> bool:
+        """Whether the arm is in servo mode, and neither paused nor stopped."""
+        return self.mode == SERVO and self.state < PAUSED
+
 
 class ReportLine:
     """The connection to the port of the reports; no call waits, but for :meth:`open`."""
 
-    def __init__(self, host: str) -> None:
-        self._host = host
+    def __init__(self, name: str, host: str) -> None:
+        self._name, self._host = name, host
         self._line: socket.socket | None = None
         self._came = b""
 
-    def open(self) -> Report:
-        """Connect, and return the first report. Raises OSError."""
+    def open(self) -> list[Report]:
+        """Connect, and return the first two or more reports. Raises ConnectionLost."""
         self.close()
-        self._line = socket.create_connection((self._host, REPORTS), timeout=1.0)
-        self._host = self._line.getpeername()[0]  # retry() must not wait for a name to be looked up
-        self._line.setblocking(False)
-        end = time.monotonic() + 1.0
-        while not (reports := self.receive()):
-            if time.monotonic() > end:
-                raise OSError(f"port {REPORTS} is silent")
-            time.sleep(0.001)
-        return reports[-1]
+        reports: list[Report] = []
+        try:
+            self._line = socket.create_connection((self._host, REPORTS), timeout=1.0)
+            self._host = self._line.getpeername()[0]  # retry() must not wait for a name to be looked up
+            self._line.setblocking(False)
+            end = time.monotonic() + 1.0
+            while len(reports) < 2:
+                if time.monotonic() > end:
+                    raise OSError("it is silent")
+                time.sleep(0.001)
+                reports += self.receive()
+        except OSError as error:
+            raise no_controller(self._name, f"port {REPORTS}: {error.strerror or error}") from error
+        return reports
 
     def retry(self) -> None:
         """Begin to connect again."""
@@ -218,7 +230,7 @@ class XArmLink:
             if not connected:
                 why = f"port {COMMANDS} of {host}: the SDK does not connect"
         if why:
-            raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
+            raise no_controller(self.name, why)
         if self._axis != self.joints:
             raise ConnectionLost(
                 f"{self.name}: the controller at {host} has an arm with {self._axis} joints, the model has "

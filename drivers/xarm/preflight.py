@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from xarm.core.config.x_config import XCONF
 
 from hal.errors import ControlTaken, Fault
 from hal.geometry import Pose
@@ -20,6 +19,7 @@ from hal.specs import RobotSpec
 
 from .faults import NO_CONTROLLER, describe_warning, error_fault, find_occupant
 from .link import PERIOD, Report, ReportLine, connect, lock_arm, probe
+from .sdk import XCONF
 from .settings import XArmSettings
 
 _FAR, _TURNED = 0.001, 0.005
@@ -43,13 +43,13 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         One result per check.
     """
     settings = XArmSettings.of(spec)
-    host, line, api, lock = settings.host, ReportLine(settings.host), None, None
+    host, line, api, lock = settings.host, ReportLine(spec.name, settings.host), None, None
     try:
         lock = lock_arm(host)
         why = probe(host)
         if why:
             raise OSError(why)
-        api, report = connect(host, report_type="rich"), line.open()
+        api, report = connect(host, report_type="rich"), line.open()[-1]
         version = ".".join(map(str, api.version_number))
         found = f"{host} answers; firmware {version}, {api.axis} joints, type {api.device_type}"
         if api.axis != len(spec.joints):

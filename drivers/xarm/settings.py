@@ -6,22 +6,13 @@ from collections.abc import Iterator
 from math import pi
 
 from hal.config.files import DeviceSettings
-from hal.config.schema import Host, Mass, Offset, Strict
+from hal.config.schema import Host, Load
 from hal.specs import RobotSpec
 
 TOP_SPEED, TOP_TCP_SPEED = pi, 1.0
 """Limits of servo mode, rad/s and m/s: 180 degrees/s and 1000 mm/s (UFACTORY's servo mode guide)."""
 RATES = 50.0, 250.0
 """Slowest and fastest stream of set-points, Hz: the controller takes at most 250 in a second."""
-
-
-class Load(Strict):
-    """Everything that is mounted on the flange, the gripper included."""
-
-    mass: Mass
-    """kg"""
-    com: Offset = (0.0, 0.0, 0.0)
-    """Centre of mass in the frame of the flange, m."""
 
 
 class XArmSettings(DeviceSettings):
