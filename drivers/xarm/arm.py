@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import time
-from math import inf
+from math import inf, isfinite
 from typing import Any
 
 from hal.driver import Reading, RobotDriver, Setpoint
@@ -129,7 +129,8 @@ class XArm(RobotDriver):
         n, last = self._n, self._last
         self._seq += len(reports)
         self._report = report = reports[-1]
-        before, periods = reports[0].q, len(reports) - 1
+        before: Floats = reports[0].q
+        periods = len(reports) - 1
         if last is not None:  # several reports may come at once, and some may be left out
             before, periods = last.q, max(len(reports), round((now - last.t) / PERIOD))
         dq = [(b - a) / (PERIOD * periods) for a, b in zip(before, report.q, strict=False)][:n]
@@ -153,7 +154,8 @@ class XArm(RobotDriver):
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
         if begins:
             link.start()
-        elif link.ready and report.takes_setpoints:
+        elif link.ready and report.takes_setpoints and isfinite(sum(last.q)):
+            link.sent = link.sent or list(last.q)  # the controller holds where the arm is: set-points begin there
             self.engaged, self._t_trouble = True, inf
 
     def write(self, setpoint: Setpoint) -> bool:
@@ -196,8 +198,7 @@ class XArm(RobotDriver):
         assert last is not None
         if report.takes_setpoints and not link.refused_setpoint:
             self._t_trouble = inf
-            sent = link.sent
-            off = 0.0 if sent is None else max(abs(a - b) for a, b in zip(sent, last.q, strict=True))
+            off = max(abs(a - b) for a, b in zip(link.sent or last.q, last.q, strict=True))
             return faults.NOT_FOLLOWING if off > self._farthest else None
         if self._t_trouble == inf:
             self._t_trouble = now

@@ -97,6 +97,23 @@ def test_an_answer_that_is_late_stops_the_arm_and_no_set_point_jumps(rig: hal.Ri
     assert not emulator.status()["error"]
 
 
+def test_an_arm_that_was_moved_by_hand_stays_there_when_the_next_session_opens(
+    rig: hal.Rig, emulator: XArmEmulator
+) -> None:
+    arm = rig.robots["arm"]
+    drive(rig, emulator, "state 4", "STOPPED")
+    emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3)
+    emulator.control.send("jog 6 -0.3")
+    moved = emulator.status()["q"]
+    recover(rig, arm)
+    with arm.control(rate_hz=50, unattended=True) as control:
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointVelocity([0.0] * 7))
+            if tick.elapsed > 0.3:
+                break
+    assert emulator.status()["target_q"] == pytest.approx(moved, abs=1e-4)
+
+
 def test_an_arm_that_is_held_back_is_stopped(rig: hal.Rig, emulator: XArmEmulator) -> None:
     arm = rig.robots["arm"]
     arm.move_to(arm.home, unattended=True, speed=0.3)
