@@ -12,7 +12,7 @@ import time
 from math import inf, isfinite
 from typing import Any
 
-from hal.driver import Reading, RobotDriver, Setpoint
+from hal.driver import Floats, Reading, RobotDriver, Setpoint
 from hal.errors import ConnectionLost, Fault, RobotFault
 from hal.specs import RobotSpec
 
@@ -144,19 +144,23 @@ class XArm(RobotDriver):
         if report is None or last is None or self._lost:
             raise ConnectionLost.of(self.spec.name, faults.SILENT)
         fault = self._fault or last.fault or link.refused
-        begins = not link.starting and time.monotonic() - link.t_ready > _STARTED
-        if fault is None and begins:
-            fault = faults.find_occupant(report.mode, report.state, max(map(abs, last.dq)) > _AT_REST)
-            if fault is faults.BUSY and self._t_read - self._t_ours < _SETTLING:
-                return  # what moves is the end of our own motion
+        if fault is None and not link.starting and time.monotonic() - link.t_ready > _STARTED:
+            fault = self._start(report, last)
         if fault is not None:
             link.refused = None
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
-        if begins:
-            link.start()
-        elif link.ready and report.takes_setpoints and isfinite(sum(last.q)):
+        if link.ready and report.takes_setpoints and isfinite(sum(last.q)):
             link.sent = link.sent or list(last.q)  # the controller holds where the arm is: set-points begin there
             self.engaged, self._t_trouble = True, inf
+
+    def _start(self, report: Report, last: Reading) -> Fault | None:
+        """Begin to switch the motors on; return why the arm must be left alone."""
+        fault = faults.find_occupant(report.mode, report.state, max(map(abs, last.dq)) > _AT_REST)
+        if fault is None:
+            self._link.start()
+        elif fault is faults.BUSY and self._t_read - self._t_ours < _SETTLING:
+            return None  # what moves is the end of our own motion: wait
+        return fault
 
     def write(self, setpoint: Setpoint) -> bool:
         self._check_open()
