@@ -84,7 +84,8 @@ def connect(host: str, **options: Any) -> XArmAPI:
     for log in (logger, origin_logger):  # they would print at every call; what matters is a fault
         log.setLevel(logging.CRITICAL)
     default = socket.getdefaulttimeout()
-    api = XArmAPI(host, is_radian=True, do_not_open=True, check_joint_limit=False, timed_comm=False, **options)
+    address = socket.gethostbyname(host)  # it takes a name for a serial port
+    api = XArmAPI(address, is_radian=True, do_not_open=True, check_joint_limit=False, timed_comm=False, **options)
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             api.connect()
