@@ -114,14 +114,14 @@ def follow_stick(rate_hz: float, presses: int, woken: bool) -> list[float]:
 
 def _move_stick(rig: hal.Rig, presses: int) -> list[float]:
     arm, pad, dice, found = rig.robots["panda"], rig.driver("pad"), np.random.default_rng(1), []
-    for _ in range(presses):
+    for k in range(presses):
         if arm.state(max_age=5.0).status is not hal.RobotStatus.FOLLOWING:
             pad.release("l2")
             time.sleep(0.1)
             pad.press("l2")
         time.sleep(0.2 + 0.02 * dice.random())  # at rest, and not in step with the loop
         begun = time.monotonic()
-        pad.stick("left_x", 1.0)
+        pad.stick("left_x", (-1.0) ** k)  # to and fro, so that no limit stops the arm
         time.sleep(0.1)
         moved = [state.stamp.t for state in arm.states(begun) if abs(state.dq_set).max() > 1e-6]
         pad.stick("left_x", 0.0)
