@@ -11,6 +11,9 @@ from ctypes import c_int32
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, HalError, NotSupported
 from hal.preflight import CheckResult
@@ -123,28 +126,36 @@ class V4l2Camera(CameraDriver):
     def _dequeue_newest(self, node: VideoNode, timeout: float) -> tuple[Buffer, bytes] | None:
         """Return the newest frame, as the kernel has it; those before it are the gaps in their numbers."""
         newest: tuple[Buffer, bytes] | None = None
-        while node.wait(timeout if newest is None else 0.0):
+        for _ in self._maps:  # not for ever, if frames come faster than they are decoded
+            if not node.wait(timeout if newest is None else 0.0):
+                break
             buffer = _make_buffer()
             try:
                 node.call(kernel.DEQUEUE, buffer)
             except BlockingIOError:
                 break
             if newest is not None and self._decoder.sequential:
-                self._make_frame(*newest, time.monotonic())
+                self._decode(*newest)
             newest = buffer, self._maps[buffer.index][: buffer.bytesused]
             node.call(kernel.QUEUE, _make_buffer(buffer.index))
         return newest
 
-    def _make_frame(self, buffer: Buffer, data: bytes, now: float) -> RawFrame | None:
-        """Return the frame of a buffer; None if it is damaged, so that its number is missing."""
+    def _decode(self, buffer: Buffer, data: bytes) -> NDArray[np.uint8] | None:
+        """Return the captured image of a buffer; None if it is damaged."""
         try:
             if buffer.flags & kernel.DAMAGED:
                 raise ValueError("the kernel reports damaged frames: use another USB port or cable")
-            image = self._output.finish(self._decoder.decode(data))
+            return self._decoder.decode(data)
         except ValueError as error:
             if str(error) != self._trouble:
                 _LOG.warning("camera %s: %s", self.spec.name, error)
             self._trouble = str(error)
+            return None
+
+    def _make_frame(self, buffer: Buffer, data: bytes, now: float) -> RawFrame | None:
+        """Return the frame of a buffer; None if it is damaged, so that its number is missing."""
+        image = self._decode(buffer, data)
+        if image is None:
             return None
         self._heard, self._patience = now, self._settings.stall_s
         stamped = buffer.flags & kernel.CLOCK == kernel.MONOTONIC
@@ -155,7 +166,7 @@ class V4l2Camera(CameraDriver):
                 how = "echo CLOCK_MONOTONIC | sudo tee /sys/module/uvcvideo/parameters/clock"
                 _LOG.warning("camera %s: %s; %s", self.spec.name, why, how)
             self._misdated, t = True, now
-        return RawFrame(t, t, buffer.sequence, color=image)
+        return RawFrame(t, t, buffer.sequence, color=self._output.finish(image))
 
     def close(self) -> None:
         node, self._node = self._node, None

@@ -25,7 +25,7 @@ from hal.config import load
 from hal.driver import RawFrame
 from hal.drivers.webcam import kernel
 from hal.drivers.webcam.capture import V4l2Camera, preflight
-from hal.drivers.webcam.pictures import PictureDecoder
+from hal.drivers.webcam.pictures import PictureDecoder, PictureOutput
 from hal.drivers.webcam.video import VideoCamera
 from hal.errors import ConfigError, ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
 from hal.images import distort_points
@@ -83,6 +83,28 @@ def test_a_damaged_frame_is_a_gap(webcam: FakeWebcam) -> None:
     numbers = [frame.seq for frame in take(camera, 5)]
     assert not {3, 4} & set(numbers)
     assert numbers[-1] >= 6
+
+
+def test_frames_that_come_faster_than_they_are_decoded_are_skipped(
+    webcam: FakeWebcam, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded, finished = [], []
+    decode, finish = PictureDecoder.decode, PictureOutput.finish
+
+    def decode_slowly(self: PictureDecoder, data: bytes) -> Any:
+        decoded.append(data)
+        assert len(decoded) < 40
+        time.sleep(0.01)
+        return decode(self, data)
+
+    monkeypatch.setattr(PictureDecoder, "decode", decode_slowly)
+    monkeypatch.setattr(PictureOutput, "finish", lambda *given: finished.append(given) or finish(*given))
+    camera = driver(rate_hz=120.0)  # H.264, whose skipped frames are decoded, too
+    camera.open()
+    frames = take(camera, 4)
+    camera.close()
+    assert all(abs(int(frame.color[20, 30, 1]) - grey(frame.seq)) <= 4 for frame in frames)
+    assert len(decoded) > len(finished) == 4
 
 
 def test_alike_cameras_are_told_apart_by_serial_or_port(tmp_path: Path) -> None:
@@ -305,8 +327,6 @@ def test_mistakes_are_named_by_their_key(camera: dict[str, Any], key: str) -> No
 
 def test_undistorted_images_show_what_a_camera_without_distortion_sees() -> None:
     cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'robot-hal[calibration]'")
-    from hal.drivers.webcam.pictures import PictureOutput
-
     spec = rig(real={"undistort": True}, output={"width": 320, "height": 240})
     K = np.array(spec.sensors["color"].K)
     ideal = np.array([[-0.35, 0.2], [0.3, -0.25], [0.0, 0.3]])
