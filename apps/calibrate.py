@@ -233,6 +233,8 @@ def _main(args: argparse.Namespace) -> int:
     guess = calibration.initial_guess(setup, args.guess) if args.auto else None
     board = _board(args)
     output = None if args.compare else calibration.RigFileOutput.of(plan.source, args.out, setup.camera)
+    if output is not None:
+        output.check(*setup.entry(hal.Pose()))
     where = f"on {setup.link_name} of" if setup.eye == "in-hand" else "beside"
     task = f"task     camera {setup.camera} {where} {setup.robot}; board of {board}"
     if args.dry_run:

@@ -68,3 +68,17 @@ def test_a_lens_that_is_not_written_is_printed_beside_that_of_the_rig_file(
     assert f"intrinsics: {found.entry()}" in said
     assert "61.0, 62.0, 30.0, 22.0 px; distortion: 0.1000" in said
     assert rig.read_bytes() == before
+
+
+def test_a_place_that_cannot_be_edited_is_refused_before_anything_opens(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(
+        "robots: {panda: {model: panda}}\n"
+        "cameras:\n"
+        "  a: {model: webcam, pose: &p [0, 0, 1, 1, 0, 0, 0]}\n"
+        "  b: {model: webcam, pose: *p}\n"
+    )
+    assert calibrate.main(["--sim", "--config", str(rig), "--camera", "b", "--dry-run"]) == 2
+    assert "edit cameras.b by hand" in capsys.readouterr().err
