@@ -156,18 +156,19 @@ def _measure_lens(args: argparse.Namespace) -> int:
         raise CommandError(f"--views must be at least {calibration.LEAST_PICTURES}, not {args.views}")
     plan = load(**config_options(args)).resolve()
     spec = choose_spec("camera", args.camera, {camera.name: camera for camera in plan.cameras})
-    if plan.engine == spec.driver:
-        raise CommandError(
-            f"camera {spec.name} is simulated, and its intrinsics are exact; add --real", code="simulated"
-        )
     output = None if args.compare else calibration.RigFileOutput.of(plan.source, args.out, spec.name)
     if output is not None:
         size = f"width: {spec.capture_width}, height: {spec.capture_height}"
         output.check("intrinsics", f"{{{size}, fx: 1, fy: 1, cx: 0, cy: 0}}")
+    driver = registry.load(spec.driver, "camera")
+    if driver.simulated:
+        raise CommandError(
+            f"camera {spec.name} is simulated, and its intrinsics are exact; add --real", code="simulated"
+        )
     views = calibration.LensViews(calibration.Detector(_board(args)))
     options = {name: value for name, value in spec.options.items() if name != "undistort"}
     raw = replace(spec, width=spec.capture_width, height=spec.capture_height, options=options)
-    camera = Camera(registry.load(spec.driver, "camera")(raw, RealClock()), RealClock(), threaded=True)
+    camera = Camera(driver(raw, RealClock()), RealClock(), threaded=True)
     try:
         camera.open()
         _take_pictures(camera, views, args.views)

@@ -82,3 +82,14 @@ def test_a_place_that_cannot_be_edited_is_refused_before_anything_opens(
     )
     assert calibrate.main(["--sim", "--config", str(rig), "--camera", "b", "--dry-run"]) == 2
     assert "edit cameras.b by hand" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("choice", ["sim: true", "sim: false, drivers: {real: mock}"])
+def test_the_lens_of_a_simulated_camera_is_not_measured(
+    choice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(calibrate, "_take_pictures", lambda *_: pytest.fail("it was opened"))
+    path = tmp_path / "rig.yaml"
+    path.write_text(f"cameras: {{scene: {{model: webcam, pose: [0, 0, 1, 1, 0, 0, 0], {choice}}}}}")
+    assert calibrate.main(["intrinsics", "--config", str(path), "--compare"]) == 2
+    assert "simulated" in capsys.readouterr().err
