@@ -7,6 +7,7 @@ import logging
 import mmap
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from ctypes import c_int32
 from pathlib import Path
 from types import MappingProxyType
@@ -30,6 +31,8 @@ _FIRST = 5.0
 """Longest time until the first frame of a camera, s."""
 _OLDEST, _AHEAD = 10.0, 1e-3
 """Greatest age of a frame that is read, and by how much its stamp may be ahead, s; others are of another clock."""
+_GONE = (errno.ENODEV, errno.ENXIO, errno.ENOENT)
+"""Errors of a device that was unplugged."""
 _RIGHTS = "no permission to open it; sudo usermod -aG video $USER, then log out and in"
 
 
@@ -182,7 +185,7 @@ def _make_buffer(index: int = 0) -> Buffer:
 
 
 def _explain(error: OSError, what: str) -> HalError:
-    if error.errno in (errno.ENODEV, errno.ENXIO, errno.ENOENT):
+    if error.errno in _GONE:
         return ConnectionLost(f"{what} was unplugged", code="unplugged")
     if error.errno == errno.EBUSY:
         return ControlTaken(f"{what} is in use by another program: end it", code="device_busy")
@@ -203,22 +206,16 @@ def _describe_modes(camera: FoundCamera, node: VideoNode) -> str:
 def _list_captures(
     cameras: list[FoundCamera], describe: Callable[[FoundCamera, VideoNode], str]
 ) -> dict[FoundCamera, str]:
-    """Return those nodes that capture images, each with its description."""
+    """Return those nodes that capture images, each with its description, or with the reason why it has none."""
     found = {}
     for camera in cameras:
         try:
-            node = VideoNode(camera.path)
+            with closing(VideoNode(camera.path)) as node:
+                if kernel.is_capture(node):
+                    found[camera] = describe(camera, node)
         except OSError as error:
-            if isinstance(error, PermissionError):
-                found[camera] = f"{camera}: {_RIGHTS}"
-            continue  # it is being unplugged
-        try:
-            if kernel.is_capture(node):
-                found[camera] = describe(camera, node)
-        except OSError:
-            continue
-        finally:
-            node.close()
+            if error.errno not in _GONE:
+                found[camera] = str(_explain(error, str(camera)))
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import mmap
+import os
 import shutil
 import time
 from collections import deque
@@ -56,7 +57,8 @@ class FakeWebcam:
             (self.usb / "serial").write_text(f"{serial}\n")
         self.values = {id: control[4] for id, control in CONTROLS.items()}
         self.plugged = self.frozen = False
-        self.denied = False
+        self.refused = 0
+        """Number of the error with which it refuses to be opened."""
         self.clock_offset = 0.0
         """How far its clock is ahead of the monotonic one, s."""
         self.damaged: set[int] = set()
@@ -220,8 +222,8 @@ def webcams(root: Path, *cameras: dict[str, str]) -> Iterator[list[FakeWebcam]]:
     def open_node(path: str) -> FakeNode:
         for camera in made:
             if camera.path == path and camera.plugged:
-                if camera.denied:
-                    raise PermissionError(errno.EACCES, "EACCES")
+                if camera.refused:
+                    raise OSError(camera.refused, os.strerror(camera.refused))
                 return FakeNode(camera)
         raise fail(errno.ENOENT)
 
