@@ -6,7 +6,7 @@ import errno
 import logging
 import mmap
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from ctypes import c_int32
 from pathlib import Path
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, HalError, NotSupported
-from hal.preflight import CheckResult
 from hal.specs import CameraSpec
 
 from . import kernel
@@ -308,40 +307,3 @@ def _get(node: VideoNode, id: int) -> float | None:
     except OSError:
         return None
     return float(record.value)
-
-
-def preflight(spec: CameraSpec, duration: float) -> Iterator[CheckResult]:
-    """Open the camera, measure its frames, and close it.
-
-    Args:
-        spec: The camera's record.
-        duration: How long frames are counted, s.
-
-    Yields:
-        One result for the camera, and one for its frames.
-    """
-    driver = V4l2Camera(spec)
-    try:
-        driver.open()
-        info = driver.info
-        serial = f'serial "{info.serial}"' if info.serial else "no serial"
-        yield CheckResult("camera", "ok", f"{info.title}, {serial}")
-        first = driver.grab(_FIRST)
-        if first is None:
-            yield CheckResult("frames", "fail", "no frame arrived", "unplug it and plug it in again")
-            return
-        frames, last, end = 0, first, time.monotonic() + duration
-        while time.monotonic() < end:
-            if (frame := driver.grab(0.2)) is not None:
-                frames, last = frames + 1, frame
-    except HalError as error:
-        yield CheckResult("camera", "fail", str(error))
-        return
-    finally:
-        driver.close()
-    rate, lost = frames / max(last.t - first.t, 1e-9), last.seq - first.seq - frames
-    text = f"{rate:.1f} of {spec.rate_hz:g} Hz, {lost} of {frames + lost} lost"
-    if rate > 0.95 * spec.rate_hz and lost <= 0.02 * frames:
-        yield CheckResult("frames", "ok", text)
-        return
-    yield CheckResult("frames", "warn", text, "add light, or set exposure_s: many cameras slow down in the dark")

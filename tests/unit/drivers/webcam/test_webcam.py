@@ -18,15 +18,17 @@ pytest.importorskip("av", reason="needs PyAV: pip install 'robot-hal[record]'")
 
 import av
 from PIL import Image
-from webcam_kit import AUTOGAIN, BRIGHTNESS, GAIN, FakeWebcam, grey, webcams
+from webcam_kit import AUTOGAIN, BRIGHTNESS, GAIN, FakeWebcam, grey, webcams, write_video
 
+from hal import registry
 from hal.camera import Camera
 from hal.clock import RealClock
 from hal.config import load
 from hal.driver import RawFrame
 from hal.drivers.webcam import kernel
-from hal.drivers.webcam.capture import V4l2Camera, preflight
+from hal.drivers.webcam.capture import V4l2Camera
 from hal.drivers.webcam.pictures import PictureDecoder, PictureOutput
+from hal.drivers.webcam.preflight import check_v4l2
 from hal.drivers.webcam.video import VideoCamera
 from hal.errors import ConfigError, ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
 from hal.images import distort_points
@@ -216,12 +218,24 @@ def test_fixed_exposure_and_focus_switch_the_automatic_ones_off(webcam: FakeWebc
 
 def test_the_preflight_counts_frames(webcam: FakeWebcam) -> None:
     spec = driver(rate_hz=60.0).spec
-    assert [result.level for result in preflight(spec, 0.3)] == ["ok", "ok"]
+    assert [result.level for result in check_v4l2(spec, 0.3)] == ["ok", "ok"]
     webcam.damaged = set(itertools.islice(itertools.count(3, 4), 100))
-    frames = list(preflight(spec, 0.3))[1]
+    frames = list(check_v4l2(spec, 0.3))[1]
     assert frames.level == "warn"
+    assert "USB port" in frames.remedy
     webcam.unplug()
-    assert [result.level for result in preflight(spec, 0.3)] == ["fail"]
+    assert [result.level for result in check_v4l2(spec, 0.3)] == ["fail"]
+
+
+def test_the_preflight_of_a_video_plays_it(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.mkv", 10, rate=60)
+    for name, names, failed in (("v.mkv", ["camera", "frames"], False), ("other.mkv", ["camera"], True)):
+        spec = camera_spec(driver="video", streams=("color",), rate_hz=60.0, options={"file": str(tmp_path / name)})
+        check = registry.function("video", registry.driver("video").camera_preflight)
+        assert check is not None
+        found = list(check(spec, 0.2))
+        assert [result.name for result in found] == names
+        assert any(result.level == "fail" for result in found) == failed  # on a busy computer, frames may be lost
 
 
 @pytest.mark.parametrize("codec", ["mjpeg", "libx264"])
