@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -104,10 +105,20 @@ class Observer:
         camera = self._rig.cameras[name]
         if after is not None:
             return camera.read(timeout, after=after)
+        begin = self._find_begin()
         try:
-            return camera.read_latest(max_age=_FRESH)
+            frame = camera.read_latest(max_age=_FRESH)
+            if frame.stamp.t >= begin:
+                return frame
         except StaleStateError:
-            return camera.read(timeout)
+            pass
+        return camera.read(timeout, after=begin)
+
+    def _find_begin(self) -> float:
+        """Return the time from which on all states are known, s: a camera may be there before an arm."""
+        arms = self._rig.robots.values()
+        mails = [device._mail for arm in arms for device in (arm, arm.gripper) if device is not None]
+        return max((mail.history.begin() for mail in mails), default=-math.inf)
 
     def _await_states(self, t: float) -> None:
         """Wait briefly for states as new as the newest frame, which may be some ms newer."""

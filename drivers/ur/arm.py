@@ -119,6 +119,7 @@ class UrArm(RobotDriver):
         self._t_new = now
         target = receive.getTargetQ()
         fault = self._judge(now, receive.getSafetyMode(), receive.getRuntimeState() == PLAYING, target)
+        fx, fy, fz, tx, ty, tz = receive.getActualTCPForce()  # in the controller's base: half a turn from the model's
         # A target lags by the lookahead time, so while set-points are sent the last one that was sent is reported.
         taken = link.sent if self.engaged and link.sent is not None else target
         self._last = Reading(
@@ -128,7 +129,7 @@ class UrArm(RobotDriver):
             receive.getActualQ(),
             receive.getActualQd(),
             q_commanded=taken,
-            wrench_ext=receive.getActualTCPForce(),
+            wrench_ext=(-fx, -fy, fz, -tx, -ty, tz),
             fault=fault,
         )
         return self._last

@@ -114,14 +114,18 @@ class UrLink:
         """Longest time between two messages since the program started, s."""
         self.t_late = 0.0
         """When this computer was last silent for nearly as long as the watchdog allows, s."""
-        self.starting = False
         self.version, self.rate, self.has_payload = "", 0.0, False
         """Of the controller: PolyScope, cycles in a second, and whether it reports the payload."""
         self._target: list[float] | None = None
         self._wake = threading.Condition()
         self._jobs: list[Callable[[], None]] = []
         self._thread: threading.Thread | None = None
-        self._ours = self._ending = False
+        self._asked: float | None = None
+        """When the start that is under way was asked for, s; None for none."""
+        self._ours = False
+        """Whether the program that runs is ours."""
+        self._end_by = 0.0
+        """Until when a program that was ours is to be ended, s."""
         self._ended = threading.Event()
         """Ends the thread."""
         self._lock: DeviceLock | None = None
@@ -161,6 +165,8 @@ class UrLink:
                 raise ConnectionLost.of(self.name, REGISTERS_TAKEN) from None
             raise ConnectionLost(f"{self.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code) from error
         _kept.extend((self._dashboard, self.receive, self._control))
+        self.lose()
+        self._end_by, self._jobs, self.refused = 0.0, [], None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, args=[self._ended], name=f"ur-{self.name}", daemon=True)
         self._thread.start()
@@ -173,9 +179,14 @@ class UrLink:
 
     def start(self) -> None:
         """Start the control program soon: then ``running`` is True, or ``refused`` says why not."""
-        self.refused, self.starting = None, True
         asked = time.monotonic()
+        self.refused, self._asked = None, asked
         self._call(lambda: self._start(asked))
+
+    @property
+    def starting(self) -> bool:
+        """Whether the control program is being started."""
+        return self._asked is not None
 
     def note_stopped(self) -> None:
         """Note that no program is running, or that it is paused."""
@@ -183,10 +194,11 @@ class UrLink:
             self.end()
 
     def end(self) -> None:
-        """End the control program soon: left alone, it goes on to the last set-point, also after a pause."""
-        if self._ours:
-            self.running, self._ours, self._ending = False, False, True
-            self._call(self._end_program)
+        """End the control program soon: one that is left running, or resumes, still moves to its last set-point."""
+        with self._wake:
+            if self._ours:
+                self.running, self._ours, self._end_by = False, False, time.monotonic() + _STALE
+                self._wake.notify()
 
     def ask_remote(self) -> None:
         """Ask soon whether the controller is in local control."""
@@ -220,7 +232,7 @@ class UrLink:
         return answers[0] if answers else None
 
     def _finish(self, job: Callable[[threading.Event], None]) -> None:
-        """Wait until the thread has done a job; it is told when nobody waits any more."""
+        """Wait until the thread has done a job; ``given_up`` is set once this stops waiting."""
         done, given_up = threading.Event(), threading.Event()
 
         def run() -> None:
@@ -236,8 +248,9 @@ class UrLink:
 
     def lose(self) -> None:
         """Note that the controller is silent: what it does is no longer known, and its watchdog ends our program."""
-        self.running = self._ours = self.starting = False
-        self._target = None
+        with self._wake:
+            self.running = self._ours = False
+            self._asked = self._target = None
 
     def close(self) -> None:
         """End the control program, and disconnect. Idempotent."""
@@ -267,7 +280,8 @@ class UrLink:
                 if not self._jobs and self._target is None:
                     self._wake.wait(_KICK)
                 target, self._target = self._target, None
-                jobs, self._jobs = self._jobs, []
+                ending = time.monotonic() < self._end_by  # that comes first, and is tried again
+                jobs, self._jobs = ([], self._jobs) if ending else (self._jobs, [])
             gap = time.monotonic() - last
             if gap > 0.7 / WATCHDOG_HZ:
                 self.t_late = time.monotonic()
@@ -276,10 +290,10 @@ class UrLink:
                 if not receive.isConnected() or not control.isConnected():
                     self.lose()
                     self._reconnect(receive, control, ended)
+                elif ending:
+                    self._end_program()
                 elif jobs:
-                    if not self._dashboard.isConnected():  # it hangs up after an answer that was late
-                        self._dashboard.disconnect()
-                        self._dashboard.connect()
+                    self._reach_dashboard()
                     for job in jobs:
                         job()
                 elif self.running:
@@ -289,7 +303,7 @@ class UrLink:
                 self.lose()
             last = time.monotonic()
         with contextlib.suppress(RuntimeError):
-            if self._ending and control.isConnected():
+            if time.monotonic() < self._end_by and control.isConnected():
                 self._end_program()
             if self._ours and control.isConnected():
                 control.stopScript()
@@ -312,13 +326,18 @@ class UrLink:
         self._dashboard.disconnect()
         self._dashboard.connect()
 
+    def _reach_dashboard(self) -> None:
+        if not self._dashboard.isConnected():  # it hangs up after an answer that was late
+            self._dashboard.disconnect()
+            self._dashboard.connect()
+
     def _ask_remote(self) -> None:
         self.local = self._has_remote and not self._dashboard.isInRemoteControl()
 
     def _end_program(self) -> None:
         """End the control program, and clear the command in its register, which the next program would execute."""
-        self._ending = False
         if self.receive.getRuntimeState() != STOPPED:
+            self._reach_dashboard()
             with contextlib.suppress(RuntimeError):  # over already, or in local control, where it is over soon
                 self._dashboard.stop()
             end = time.monotonic() + _END
@@ -326,14 +345,21 @@ class UrLink:
                 time.sleep(0.002)
         if self.receive.getRuntimeState() == STOPPED:
             self._control.kickWatchdog()  # without a program it only clears the register
+            self._end_by = 0.0
 
     def _start(self, asked: float) -> None:
+        if asked != self._asked:  # the connection was lost meanwhile
+            return
         refused: Fault | None = NOT_STARTED
         try:
             if time.monotonic() - asked < _STALE:
                 refused = self._start_program()
         finally:
-            self.running, self.refused, self.starting = refused is None, refused, False
+            with self._wake:
+                if asked == self._asked:
+                    self.running, self.refused, self._asked = refused is None, refused, None
+                elif refused is None:
+                    self._end_by = time.monotonic() + _STALE
 
     def _start_program(self) -> Fault | None:
         """Start the control program with its watchdog; return why that was not possible."""
@@ -342,7 +368,7 @@ class UrLink:
         if self.local:
             return LOCAL
         end = time.monotonic() + _END  # of ours that was lost, and of states that come late
-        while self.receive.getRuntimeState() == PLAYING and not self._ours:
+        while self.receive.getRuntimeState() != STOPPED and not self._ours:
             if time.monotonic() > end:
                 return OTHER_PROGRAM
             time.sleep(0.002)

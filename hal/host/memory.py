@@ -8,6 +8,7 @@ which reorders stores, notices and tries again, a bounded number of times.
 
 from __future__ import annotations
 
+import math
 import struct
 from array import array
 from collections.abc import Callable, Sequence
@@ -228,6 +229,11 @@ class History(Generic[State]):
         first = self._find_first(t, newest)
         found = (self._box.bytes_at(number) for number in range(first, newest + 1))
         return [self._decode(record) for record in found if record is not None]
+
+    def begin(self) -> float:
+        """Return the time of the oldest state that is kept, s; minus infinity if there is none."""
+        record = self._box.bytes_at(self._box.oldest)
+        return -math.inf if record is None else float(_T.unpack_from(record)[0])
 
     def find_around(self, t: float) -> tuple[State, State] | None:
         """Return the last state at or before ``t`` (s) and the first after it, or the newest twice.

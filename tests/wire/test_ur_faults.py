@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from math import inf
 
 import pytest
+from waiting import wait_until
 
 import hal
 from hal_emulators.control import EmulatorControl
@@ -147,6 +148,36 @@ def test_an_arm_that_was_moved_by_hand_stays_there_when_the_next_session_opens(
     assert not any("C153" in event for event in emulator.status()["events"] if event not in events)
 
 
+def test_a_program_that_was_being_started_as_the_connection_was_lost_is_ended() -> None:
+    """Nothing asks for its program any more: it must not run on, with its watchdog fed."""
+    from hal.drivers.ur.link import UrLink
+    from hal.drivers.ur.settings import UrSettings
+
+    other = UrEmulator()
+    link = UrLink("arm", UrSettings(host=other.host), 500.0, None)
+    link.open()
+    try:
+        for _ in range(2):  # a link that is opened again begins anew
+            link.start()
+            other.wait_for(lambda status: status["program"] == "rtde_control")
+            link.lose()
+            other.wait_for(lambda status: not status["program"])
+            assert not link.running
+            link.close()
+            link.open()
+            assert not link.starting
+    finally:
+        link.close()
+        other.close()
+
+
+def test_a_push_is_a_force_in_the_axes_of_the_models_base(rig: hal.Rig, emulator: UrEmulator) -> None:
+    """The controller's base is turned by half a turn."""
+    emulator.control.send("push 3 4 5")
+    arm = rig.robots["arm"]
+    wait_until(lambda: arm.state().wrench_ext[:3] == pytest.approx([-3, -4, 5]), "the force is known")
+
+
 def test_a_session_gives_the_controller_load_and_tcp_of_the_rig(rig: hal.Rig, emulator: UrEmulator) -> None:
     rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
     status = emulator.status()
@@ -160,6 +191,10 @@ def test_an_arm_that_runs_another_program_opens_no_session(emulator: UrEmulator)
         with hal.open(other.rig()) as rig, EmulatorControl(other.host) as control:
             control.send("program gluing")
             other.wait_for(lambda status: status["program"] == "gluing")
+            with pytest.raises(hal.RobotFault) as refused:
+                rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
+            assert refused.value.code == "OTHER_PROGRAM"
+            control.send("pause on")
             with pytest.raises(hal.RobotFault) as refused:
                 rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
             assert refused.value.code == "OTHER_PROGRAM"

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import hal
+from hal.config.data_files import find_data
 
 from .test_ur_faults import recover, wait_code
 from .ur_kit import UrEmulator
@@ -147,3 +148,20 @@ def test_a_lost_state_now_and_then_stops_nothing(emulator: UrEmulator) -> None:
         arm = rig.robots["arm"]
         assert abs(arm.move_to(arm.home + 0.2, unattended=True, speed=0.3).q - arm.home - 0.2).max() < 2e-3
         assert arm.state(max_age=inf).fault is None
+
+
+def test_a_cb3_is_driven_at_125_hz(tmp_path: Path) -> None:
+    """Its PolyScope knows no remote control; the model is one of a user's own."""
+    text = find_data("robots", "ur5e.yaml").read_text(encoding="utf-8")
+    (tmp_path / "my_ur5.yaml").write_text(text.replace("rate_hz: 500", "rate_hz: 125"), encoding="utf-8")
+    emulator = UrEmulator("--robot", "ur5")
+    try:
+        rig = emulator.rig()
+        rig["robots"]["arm"]["model"] = str(tmp_path / "my_ur5.yaml")
+        with hal.open(rig) as opened:
+            arm = opened.robots["arm"]
+            goal = arm.home + 0.1
+            assert arm.move_to(goal, unattended=True).q == pytest.approx(goal, abs=2e-3)
+        assert not emulator.status()["program"]
+    finally:
+        emulator.close()

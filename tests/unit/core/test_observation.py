@@ -77,6 +77,15 @@ def test_an_old_frame_is_not_returned() -> None:
         assert rig.observe(timeout=10.0).cameras["wrist"].frame.stamp.t > old.stamp.t + 0.3
 
 
+def test_a_frame_from_before_the_first_state_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera is there before an arm when a rig opens."""
+    with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
+        rig.observe(timeout=10.0)
+        begin = rig.clock.now() + 0.1
+        monkeypatch.setattr(rig.robots["panda"]._mail.history, "begin", lambda: begin)
+        assert all(moment.frame.stamp.t >= begin for moment in rig.observe(timeout=10.0).cameras.values())
+
+
 def test_a_camera_without_new_frames_is_an_error() -> None:
     with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
         rig.observe(timeout=10.0)

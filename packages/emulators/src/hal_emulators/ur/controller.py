@@ -53,6 +53,8 @@ class Controller:
         """Name of the program that is running."""
         self.paused = False
         """Whether the program is paused."""
+        self.force = [0.0] * 6
+        """What pushes the arm, N and Nm in the controller's base."""
         self.offset = 0
         self.events: list[str] = []
         """What happened, the newest last."""
@@ -117,9 +119,13 @@ class Controller:
         """Switch the safeguard stop (a light curtain) on or off: it pauses a program, which then goes on by itself."""
         if self.safety_mode in (NORMAL, SAFEGUARD_STOP):
             self.safety_mode = SAFEGUARD_STOP if active else NORMAL
-            self.paused, self._t_written = active and bool(self.program), self.now
-            if active:
-                self.motion.stop(_PROTECTIVE_DECELERATION)
+            self.pause(active)
+
+    def pause(self, paused: bool) -> None:
+        """Pause the program, or let it go on, as at the pendant."""
+        self.paused, self._t_written = paused and bool(self.program), self.now
+        if paused:
+            self.motion.stop(_PROGRAM_STOP)
 
     def jog(self, joint: int, angle: float) -> None:
         """Move a joint by hand, rad. Raises ValueError while a program runs."""
@@ -268,6 +274,7 @@ class Controller:
             "actual_qd": motion.actual_dq,
             "actual_TCP_pose": forward(self.robot, motion.actual_q, self.tcp),
             "target_TCP_pose": forward(self.robot, motion.q, self.tcp),
+            "actual_TCP_force": self.force,
             "robot_mode": self.robot_mode,
             "safety_mode": self.safety_mode,
             "safety_status": self.safety_mode,

@@ -47,6 +47,8 @@ COMMANDS = {
     "remote": ("on|off", "remote or local control"),
     "slider": ("SHARE", "the speed slider, 0 to 1"),
     "jog": ("JOINT RAD", "move a joint (0 to 5) by hand, while no program runs"),
+    "push": ("FX FY FZ", "push the arm, N in the controller's base"),
+    "pause": ("on|off", "pause the program, or let it go on"),
     "program": ("[NAME]", "run another program, or stop the one that is running"),
     "lose": ("SHARE", "leave out this share of the states"),
     "late": ("S", "send states so much later"),
@@ -338,6 +340,8 @@ class UrServer:
             "remote": lambda: controller.set_remote(_switch(values[0])),
             "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
             "jog": lambda: controller.jog(int(_number(values[0], 0, 5)), _number(values[1], -3.0, 3.0)),
+            "push": lambda: setattr(controller, "force", [*(_number(x, -1e3, 1e3) for x in values[:3]), 0.0, 0.0, 0.0]),
+            "pause": lambda: controller.pause(_switch(values[0])),
             "program": lambda: (
                 controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant")
             ),
