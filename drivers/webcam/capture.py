@@ -115,15 +115,14 @@ class V4l2Camera(CameraDriver):
             except OSError as error:
                 raise _explain(error, f"camera {self.spec.name}") from error
             now = time.monotonic()
-            if buffer is None:
-                if now - self._heard > self._patience:
-                    why = self._trouble or "it sends nothing; unplug it and plug it in again, or use another USB port"
-                    text = f"no frame of camera {self.spec.name} for {now - self._heard:.1f} s: {why}"
-                    raise ConnectionLost(text, code="stalled")
-                if now >= deadline:
-                    return None
-            elif (frame := self._make_frame(*buffer, now)) is not None:
+            if buffer is not None and (frame := self._make_frame(*buffer, now)) is not None:
                 return frame
+            if now - self._heard > self._patience:
+                why = self._trouble or "it sends nothing; unplug it and plug it in again, or use another USB port"
+                text = f"no frame of camera {self.spec.name} for {now - self._heard:.1f} s: {why}"
+                raise ConnectionLost(text, code="stalled")
+            if now >= deadline:
+                return None
 
     def _dequeue_newest(self, node: VideoNode, timeout: float) -> tuple[Buffer, bytes] | None:
         """Return the newest frame, as the kernel has it; those before it are the gaps in their numbers."""

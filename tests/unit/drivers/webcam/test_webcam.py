@@ -110,6 +110,24 @@ def test_frames_that_come_faster_than_they_are_decoded_are_skipped(
     assert len(decoded) > len(finished) == 4
 
 
+def test_a_camera_that_sends_only_damaged_frames_faster_than_they_are_read_ends_the_wait(
+    webcam: FakeWebcam, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = []
+
+    def fail_slowly(*given: Any) -> Any:
+        tries.append(given)
+        assert len(tries) < 100
+        time.sleep(0.02)
+        raise ValueError("not an image")
+
+    monkeypatch.setattr(PictureDecoder, "decode", fail_slowly)
+    camera = driver(rate_hz=60.0)
+    camera.open()
+    assert camera.grab(0.1) is None
+    camera.close()
+
+
 def test_alike_cameras_are_told_apart_by_serial_or_port(tmp_path: Path) -> None:
     alike = [{"serial": "A1", "port": "1-1"}, {"port": "1-2"}, {"port": "1-3"}, {"name": "Other Cam", "port": "1-4"}]
     with webcams(tmp_path, *alike) as cameras:
