@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import importlib
 import logging
 import os
+import threading
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from difflib import get_close_matches
@@ -168,8 +170,18 @@ class Rig:
             host.request("reset_statistics")  # leave out the start
 
     def _wait_for_hosts(self, realtime: bool) -> None:
-        """Wait until every process is ready, and note if an arm's did not get the real-time priority it asked for."""
-        ready = [(host.wait_ready(), host.spec.robots) for host in self._hosts if isinstance(host, RemoteHost)]
+        """Wait until every process is ready, and note if an arm's did not get the real-time priority it asked for.
+
+        Meanwhile a thread imports what the first control session needs: a signal in the middle of the import of a
+        compiled library ends Python, and no thread but the main one gets any.
+        """
+        remote = [host for host in self._hosts if isinstance(host, RemoteHost)]
+        preparing = threading.Thread(target=importlib.import_module, args=["hal.servo.controllers"])
+        if remote:
+            preparing.start()
+        ready = [(host.wait_ready(), host.spec.robots) for host in remote]
+        if remote:
+            preparing.join()
         if not realtime or self.lock_step or all(answer["realtime"] or not robots for answer, robots in ready):
             return
         from .preflight import REALTIME_RIGHT

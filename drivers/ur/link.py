@@ -7,12 +7,11 @@ ports have answered. Its other calls release the lock. Its objects are never del
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import dashboard_client
@@ -20,7 +19,7 @@ import rtde_control
 import rtde_receive
 
 from hal.errors import ConnectionLost, Fault
-from hal.host.scheduling import PRIORITY
+from hal.host.scheduling import note_threads
 from hal.lock import DeviceLock
 
 from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN, STOPPED
@@ -71,21 +70,6 @@ def probe(host: str, timeout: float = 1.0) -> str:
         except OSError as error:
             return f"port {port} of {host}: {error.strerror or error}"
     return ""
-
-
-@contextlib.contextmanager
-def share_priority() -> Iterator[None]:
-    """Give the threads that are created meanwhile, ur_rtde's too, a priority below the servo's, where permitted."""
-    try:
-        before = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY - 1))
-    except (AttributeError, OSError):  # Linux only, and only where it is allowed
-        yield
-        return
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, *before)
 
 
 class UrLink:
@@ -139,7 +123,7 @@ class UrLink:
         why = probe(host)
         if why:
             raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
-        with share_priority():
+        with note_threads():
             self._connect(host)
 
     def _connect(self, host: str) -> None:
@@ -282,10 +266,7 @@ class UrLink:
                 target, self._target = self._target, None
                 ending = time.monotonic() < self._end_by  # that comes first, and is tried again
                 jobs, self._jobs = ([], self._jobs) if ending else (self._jobs, [])
-            gap = time.monotonic() - last
-            if gap > 0.7 / WATCHDOG_HZ:
-                self.t_late = time.monotonic()
-            self.longest_gap = max(self.longest_gap, gap)
+            self._note_gap(time.monotonic() - last)
             try:
                 if not receive.isConnected() or not control.isConnected():
                     self.lose()
@@ -303,12 +284,21 @@ class UrLink:
                 self.lose()
             last = time.monotonic()
         with contextlib.suppress(RuntimeError):
-            if time.monotonic() < self._end_by and control.isConnected():
-                self._end_program()
-            if self._ours and control.isConnected():
-                control.stopScript()
-            control.disconnect()
-            receive.disconnect()
+            self._disconnect(receive, control)
+
+    def _disconnect(self, receive: Any, control: Any) -> None:
+        if time.monotonic() < self._end_by and control.isConnected():
+            self._end_program()
+        if self._ours and control.isConnected():
+            control.stopScript()
+        control.disconnect()
+        receive.disconnect()
+
+    def _note_gap(self, gap: float) -> None:
+        """Note the time since the last message, s."""
+        if gap > 0.7 / WATCHDOG_HZ:
+            self.t_late = time.monotonic()
+        self.longest_gap = max(self.longest_gap, gap)
 
     def _serve(self, control: Any, target: list[float] | None) -> None:
         if target is None:

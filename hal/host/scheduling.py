@@ -10,6 +10,7 @@ import platform
 import signal
 import struct
 import sys
+from collections.abc import Iterator
 
 from ..preflight import may_lock_memory
 
@@ -23,6 +24,8 @@ _SYSCALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 """Machine -> numbers of sched_setattr and sched_getattr, for which Python has no function."""
 _ATTRIBUTES = struct.Struct("=IIQiIQQQII")
 """sched_attr(2): size, policy, flags, nice, priority, runtime in ns, deadline, period, two clamps."""
+_noted: set[int] = set()
+"""Threads without which the host's is late as well."""
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_TIMERSLACK = 29
 
@@ -48,6 +51,8 @@ def prepare_process(realtime: bool) -> None:
     _limit_runaway()
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+        for thread in _noted & _list_threads():
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY - 1))
     except OSError:
         _shorten_slice()
     if may_lock_memory():
@@ -59,6 +64,21 @@ def is_realtime() -> bool:
     if not sys.platform.startswith("linux"):
         return False
     return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
+
+
+@contextlib.contextmanager
+def note_threads() -> Iterator[None]:
+    """Note the threads that a library starts meanwhile: :func:`prepare_process` puts them just below this one."""
+    before = _list_threads()
+    yield
+    _noted.update(_list_threads() - before)
+
+
+def _list_threads() -> set[int]:
+    try:
+        return set(map(int, os.listdir("/proc/self/task")))
+    except OSError:  # Linux only
+        return set()
 
 
 def describe() -> str:
@@ -104,7 +124,7 @@ def _limit_runaway() -> None:
 
 def _shorten_slice() -> None:
     """Set the slice of this thread; Linux before 6.12 ignores it."""
-    attributes = _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, 0, 0, int(1e9 * SLICE), 0, 0, 0, 0)
+    attributes = _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, os.nice(0), 0, int(1e9 * SLICE), 0, 0, 0, 0)
     numbers = _SYSCALLS.get(platform.machine())
     if numbers is not None:
         ctypes.CDLL(None).syscall(numbers[0], 0, ctypes.create_string_buffer(attributes), 0)

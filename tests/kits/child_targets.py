@@ -1,6 +1,7 @@
 """What children run in tests: of test_process.py, and a console that waits for nobody long."""
 
 import os
+import threading
 import time
 
 from hal.errors import ConfigError, ConnectionLost, Problem
@@ -65,17 +66,24 @@ def scheduled(channel, memories, config):
     """Prepare as a servo's host, without the right to real-time priority if so configured; tell how it is scheduled."""
     import resource
 
-    from hal.host.scheduling import describe, is_realtime, prepare_process
+    from hal.host.scheduling import describe, is_realtime, note_threads, prepare_process
 
     if config["refused"]:
         give_up_right()
+    ended = threading.Event()
+    beside, noted = (threading.Thread(target=ended.wait, daemon=True) for _ in range(2))
+    beside.start()
+    with note_threads():
+        noted.start()
     prepare_process(config["realtime"])
+    priorities = [os.sched_getparam(thread.native_id).sched_priority for thread in (noted, beside)]
 
     def state():
         with open("/proc/self/status") as file:
             locked = next(int(line.split()[1]) for line in file if line.startswith("VmLck"))
         limits = resource.getrlimit(resource.RLIMIT_RTTIME)
-        return {"realtime": is_realtime(), "text": describe(), "limits": limits, "locked_kb": locked}
+        found = {"realtime": is_realtime(), "text": describe(), "limits": limits, "locked_kb": locked}
+        return {**found, "threads": priorities}
 
     channel.send({"ready": state()})
     message = channel.receive(60.0)

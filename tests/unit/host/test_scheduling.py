@@ -12,7 +12,7 @@ import pytest
 
 import hal
 from hal.host.process import Child
-from hal.host.scheduling import describe, is_realtime
+from hal.host.scheduling import PRIORITY, describe, is_realtime
 from hal.preflight import check_machine, may_lock_memory
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux")
@@ -47,6 +47,7 @@ def test_a_host_gets_real_time_priority_where_the_user_has_the_right(start: STAR
     assert ready["realtime"] is allowed()
     assert ready["text"].startswith("SCHED_FIFO" if allowed() else "default")
     assert (ready["locked_kb"] > 1000) is may_lock_memory()
+    assert ready["threads"] == ([PRIORITY - 1, 0] if allowed() else [0, 0])  # noted, and another one
 
 
 def test_without_the_right_it_gets_a_short_slice_where_the_kernel_has_them(start: START) -> None:
@@ -60,6 +61,7 @@ def test_a_host_that_does_not_ask_stays_as_it_is(start: START) -> None:
     ready = start(realtime=False).ready
     assert not ready["realtime"]
     assert ready["text"] == describe()
+    assert ready["threads"] == [0, 0]
     assert ready["locked_kb"] == 0
 
 
