@@ -129,6 +129,10 @@ class Controller:
         if paused:
             self.motion.stop(_PROGRAM_STOP)
 
+    def push(self, force: Sequence[float]) -> None:
+        """Push the arm with a force (3,), N in the controller's base."""
+        self.force = [*force, 0.0, 0.0, 0.0]
+
     def jog(self, joint: int, angle: float) -> None:
         """Move a joint by hand, rad. Raises ValueError while a program runs."""
         if self.program:

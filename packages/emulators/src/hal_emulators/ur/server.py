@@ -336,7 +336,7 @@ class UrServer:
             "limit": lambda: setattr(controller.motion, "limit", _number(values[0], 0.01, 1.0)),
             "stuck": lambda: setattr(controller, "stuck", read_switch(values[0])),
             "jog": lambda: controller.jog(int(_number(values[0], 0, 5)), _number(values[1], -3.0, 3.0)),
-            "push": lambda: setattr(controller, "force", [*(_number(values[k], -1e3, 1e3) for k in range(3)), 0.0, 0.0, 0.0]),
+            "push": lambda: controller.push([_number(values[k], -1e3, 1e3) for k in range(3)]),
             "pause": lambda: controller.pause(read_switch(values[0])),
             "program": lambda: (
                 controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant")
