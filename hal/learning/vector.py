@@ -194,7 +194,8 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
         except (TypeError, ValueError) as error:
             raise CommandError(f"actions are numbers: {error}", code="bad_action") from None
         answers = self._request("step", [{}] * len(self._parts))
-        infos: dict[str, Any] = {"elapsed": steps["elapsed"].copy(), "_elapsed": np.ones(self.num_envs, bool)}
+        elapsed = steps["elapsed"].copy()
+        infos: dict[str, Any] = {"elapsed": elapsed, "_elapsed": ~np.isnan(elapsed)}
         for part, answer in zip(self._parts, answers, strict=True):
             if answer is not None:
                 infos = self._infos(_unpack(answer), infos, part.start)

@@ -15,7 +15,8 @@ from typing import NamedTuple
 from hal.config.loader import load
 from hal.specs import RobotSpec
 from hal_emulators.control import note_signals
-from hal_emulators.shared_world import has_world
+from hal_emulators.shared_world import find_address, has_world
+from hal_emulators.ur.motion import ROBOTS
 
 _END = 10.0
 """Longest time that the emulators take to end, s."""
@@ -42,7 +43,7 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
 
     Raises:
         ConfigError: The rig is not valid.
-        ValueError: A device is not at an address of this computer, or nothing is real.
+        ValueError: A device is not at an address of this computer, a UR's model has no emulator, or nothing is real.
     """
     rig = load(config, sim=False, overrides=overrides).resolve()
     words = ["--config", config, *(word for value in overrides for word in ("--set", value))]
@@ -69,8 +70,11 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
         return Emulator("robotiq", ["robotiq", *words])
     if arm.driver != driver or driver not in ("franka", "ur", "xarm"):
         return None
-    options = ["--host", str(arm.options["host"]), *(words if in_world else [])]
+    options = ["--host", find_address(arm), *(words if in_world else [])]
     if driver == "ur":
+        if arm.model not in ROBOTS:
+            known = ", ".join(sorted(ROBOTS))
+            raise ValueError(f"{arm.name}: its model {arm.model} has no emulator, only {known}")
         return Emulator(arm.name, ["ur", "--robot", arm.model, *options])
     if driver == "xarm":
         return Emulator(arm.name, ["xarm", "--robot", f"xarm{len(arm.joints)}", *options])

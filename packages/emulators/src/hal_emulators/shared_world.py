@@ -139,10 +139,16 @@ def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
                 process.kill()
 
 
+def find_address(arm: RobotSpec) -> str:
+    """Return the address of an emulated arm: that of ``localhost`` as a number."""
+    host = str(arm.options.get("host"))
+    return "127.0.0.1" if host.removesuffix(".").lower() == "localhost" else host
+
+
 def find_arm(config: str, overrides: Sequence[str], driver: str, host: str) -> RobotSpec:
     """Return the arm of a rig that has this driver and address. Raises ConfigError, and ValueError if none has."""
     rig = load(config, sim=False, overrides=overrides).resolve()
-    arm = next((arm for arm in rig.robots if arm.driver == driver and arm.options.get("host") == host), None)
+    arm = next((arm for arm in rig.robots if arm.driver == driver and find_address(arm) == host), None)
     if arm is None:
         raise ValueError(f"{config} has no {driver} at {host}: change --host, or --set robots.NAME.real.host")
     return arm

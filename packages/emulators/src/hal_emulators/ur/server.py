@@ -43,6 +43,8 @@ COMMANDS = {
     "power": ("on|off", "switch the arm on and release its brakes, or off"),
     "remote": ("on|off", "remote or local control"),
     "slider": ("SHARE", "the speed slider, 0 to 1"),
+    "limit": ("SHARE", "scale the speed, 0.01 to 1, as near a safety limit"),
+    "stuck": ("on|off", "ignore set-points"),
     "jog": ("JOINT RAD", "move a joint (0 to 5) by hand, while no program runs"),
     "push": ("FX FY FZ", "push the arm, N in the controller's base"),
     "pause": ("on|off", "pause the program, or let it go on"),
@@ -164,7 +166,7 @@ class UrServer:
                 due = time.monotonic()
             self.controller.step()
             if self.world is not None:
-                self.world.exchange(self.controller.dt, self.controller.motion.q)
+                self.world.exchange(self.controller.dt, self.controller.motion.actual_q)
             self._publish()
 
     def close(self) -> None:
@@ -331,8 +333,10 @@ class UrServer:
             "power": lambda: controller.set_power(RUNNING if read_switch(values[0]) else POWER_OFF),
             "remote": lambda: controller.set_remote(read_switch(values[0])),
             "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
+            "limit": lambda: setattr(controller.motion, "limit", _number(values[0], 0.01, 1.0)),
+            "stuck": lambda: setattr(controller, "stuck", read_switch(values[0])),
             "jog": lambda: controller.jog(int(_number(values[0], 0, 5)), _number(values[1], -3.0, 3.0)),
-            "push": lambda: setattr(controller, "force", [*(_number(x, -1e3, 1e3) for x in values[:3]), 0.0, 0.0, 0.0]),
+            "push": lambda: controller.push([_number(values[k], -1e3, 1e3) for k in range(3)]),
             "pause": lambda: controller.pause(read_switch(values[0])),
             "program": lambda: (
                 controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant")
@@ -361,8 +365,8 @@ class UrServer:
     def _refresh(self) -> None:
         old = self.controller
         self._lose = self._delay = self._silent_until = self._cut_until = 0.0
-        self.controller = Controller(old.robot, self._home, 0.0, [0.0] * 6)
-        self.controller.now = old.now
+        self.controller = Controller(old.robot, self._home, old.payload, old.tcp)
+        self.controller.cog, self.controller.now = old.cog, old.now
 
     def _describe(self) -> dict[str, Any]:
         controller, motion = self.controller, self.controller.motion
