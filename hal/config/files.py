@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, TypeAdapter, ValidationError
 
 from ..errors import ConfigError, Problem
 from ..specs import CameraSpec, GripperSpec, RobotSpec
@@ -77,6 +77,17 @@ def suggest(word: str, choices: Iterable[str]) -> str:
     close = find_closest(word, known)
     hint = f"; did you mean {close!r}?" if close else ";"
     return f"{hint} available: {', '.join(known)}" if known else "; none are available"
+
+
+def one_of(kind: str, names: Collection[str]) -> AfterValidator:
+    """Return a check, for an ``Annotated`` type, that a name is one of ``names``, which are those of a ``kind``."""
+
+    def check(name: str) -> str:
+        if name not in names:
+            raise ValueProblem(f"{name!r} is not a known {kind}{suggest(name, names)}", "unknown_control")
+        return name
+
+    return AfterValidator(check)
 
 
 def copy_plain(value: Any) -> Any:

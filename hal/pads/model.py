@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
-from ..config.files import Problems, suggest, validate
+from ..config.files import Problems, one_of, validate
 from ..config.schema import Strict, ValueProblem
 from ..types import AXES, BUTTONS
 from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
@@ -76,15 +76,6 @@ class Identity(NamedTuple):
         return _BUSES.get(self.bus, "other")
 
 
-def _check_name(kind: str, names: Collection[str]) -> AfterValidator:
-    def check(name: str) -> str:
-        if name not in names:
-            raise ValueProblem(f"{name!r} is not a known {kind}{suggest(name, names)}", "unknown_control")
-        return name
-
-    return AfterValidator(check)
-
-
 def _axis(text: str) -> str:
     name = text.removeprefix("-")
     if name not in AXES:
@@ -109,7 +100,7 @@ class MatchRule(Strict):
     """Part of the device's name; the case does not matter."""
     driver: str | None = None
     """The kernel's driver: the same pad has other event codes with another driver."""
-    bus: Annotated[str, _check_name("bus", ("usb", "bluetooth"))] | None = None
+    bus: Annotated[str, one_of("bus", ("usb", "bluetooth"))] | None = None
     wireless: bool = False
     """Whether the device is only the receiver of a wireless pad, so that it stays when the pad is gone."""
     title: str | None = None
@@ -134,23 +125,23 @@ class PadModel(Strict):
     title: str
     """Name to display."""
     match: tuple[MatchRule, ...] = ()
-    axes: dict[Annotated[str, _check_name("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
+    axes: dict[Annotated[str, one_of("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
     """Event code -> axis, or ``-axis`` where the kernel's value grows the other way (on sticks, downwards). Codes that
     a pad does not send are allowed."""
-    buttons: dict[Annotated[str, _check_name("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
+    buttons: dict[Annotated[str, one_of("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
     """Event code -> button; ``+dpad_y`` etc. where the directions of the d-pad are buttons."""
-    ranges: dict[Annotated[str, _check_name("event code of an axis", _AXIS_CODES)], tuple[int, int]] = Field(
+    ranges: dict[Annotated[str, one_of("event code of an axis", _AXIS_CODES)], tuple[int, int]] = Field(
         default_factory=dict
     )
     """Event code -> (minimum, maximum): required for ``REL_`` axes, which report none, and for axes whose reported
     range is wrong."""
-    absolute: tuple[Annotated[str, _check_name("axis", [name for name in AXES if name not in BUTTONS])], ...] = ()
+    absolute: tuple[Annotated[str, one_of("axis", [name for name in AXES if name not in BUTTONS])], ...] = ()
     """Axes that stay where they are put, such as levers; none that is also a button, for a dead-man springs back."""
     motion_node: str | None = None
     """End of the name of the pad's motion sensor, which reports all the time and so shows that the pad is connected."""
     touch_node: str | None = None
     """End of the name of the pad's touchpad, a separate device; pressing it is the button ``touchpad``."""
-    printed: Annotated[str, _check_name("family of pads", PRINTED)] | None = None
+    printed: Annotated[str, one_of("family of pads", PRINTED)] | None = None
     """Family of pads (of :data:`PRINTED`) whose names of the controls this pad has; None for plain names."""
     mapping: str | None = None
     """Teleoperation mapping for this pad (``config/teleop``); default: ``default``."""

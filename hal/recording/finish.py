@@ -286,8 +286,7 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         tasks.append(about["task"])
     made: list[tuple[Path, Path]] = []
 
-    t_start = float(rest.rows[0, _place(about["columns"], GRID)])
-    columns = _columns(rest, t_start)
+    t_start, columns = _columns(rest)
     rows = len(rest.rows)
     closed = _about(rest, number, t_start, recovered)
     columns |= {
@@ -381,8 +380,8 @@ def interventions(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return found
 
 
-def _columns(rest: LiveContent, t_start: float) -> dict[str, NDArray[Any]]:
-    """Return the columns (rows, n) of a live folder, with times since the first row.
+def _columns(rest: LiveContent) -> tuple[float, dict[str, NDArray[Any]]]:
+    """Return the time of the first row of a live folder, s, and its columns (rows, n), with times since then.
 
     The action is the set-point one row later.
     """
@@ -391,19 +390,14 @@ def _columns(rest: LiveContent, t_start: float) -> dict[str, NDArray[Any]]:
     for key, _, names in rest.about["columns"]:
         columns[key] = rest.rows[:, place : place + len(names)]
         place += len(names)
+    t_start = float(columns[GRID][0, 0])
     for key, values in columns.items():
         if key.startswith(TIMES):
             values[:, 0] -= t_start
     setpoint = columns[SETPOINT]
     columns[ACTION] = np.concatenate([setpoint[1:], setpoint[-1:]])
     assert columns[ACTION].shape[1] == columns[STATE].shape[1]
-    return columns
-
-
-def _place(columns: list[list[Any]], key: str) -> int:
-    """Return the index of a column's first number in a row."""
-    keys = [column[0] for column in columns]
-    return sum(len(names) for _, _, names in columns[: keys.index(key)])
+    return t_start, columns
 
 
 def _about(rest: LiveContent, number: int, t_start: float, recovered: bool) -> dict[str, Any]:
