@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import AfterValidator, BaseModel, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from ..config.files import Problems, one_of, validate
+from ..config.files import check_record, one_of
 from ..config.schema import Strict, ValueProblem
 from ..types import AXES, BUTTONS
 from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
@@ -54,7 +54,6 @@ PRINTED: Mapping[str, Mapping[str, str]] = {
 }
 """Family of pads -> control -> its name as printed on the pad, or how it is moved."""
 
-_M = TypeVar("_M", bound=BaseModel)
 _BUSES = {BUS_USB: "usb", BUS_BLUETOOTH: "bluetooth"}
 _AXIS_CODES = (*ABS, *REL)
 
@@ -169,14 +168,6 @@ class PadModel(Strict):
 
         text: str = yaml.safe_dump(self.model_dump(exclude_defaults=True, mode="json"), sort_keys=False)
         return re.sub(r"(vendor|product): (\d+)$", lambda m: f"{m[1]}: 0x{int(m[2]):04x}", text, flags=re.MULTILINE)
-
-
-def check_record(cls: type[_M], data: Mapping[str, Any], file: str) -> _M:
-    """Return ``data`` as a record. Raises ConfigError, which lists every problem; ``file`` is the name in them."""
-    problems = Problems()
-    record = validate(cls, data, file, problems)
-    problems.raise_any()
-    return record
 
 
 def pad_model(data: Mapping[str, Any], file: str = "<gamepad model>") -> PadModel:

@@ -200,7 +200,6 @@ class _TrimmedEpisode(Episode):
         return table
 
     def check_pictures(self) -> None:
-        """Check the pictures of the whole episode."""
         self._whole.check_pictures()
 
 

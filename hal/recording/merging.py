@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..errors import CommandError, DatasetError
 from .about import split_about
 from .changing import existing_episodes, refuse_foreign
-from .checking import format_differences
+from .checking import camera_differences, format_differences
 from .codecs import Stats, column_stats, copy_records, merge_stacked, merge_stats, stats_as_lists
 from .dataset import Dataset, Episode
 from .finish import entries_table, entry_row, last_row, new_info, stats_of, stats_row, tasks_table, write_table
@@ -248,7 +248,8 @@ def _sources(
             file = str(strays[0].relative_to(layout.root))
             raise DatasetError("belongs to no episode and would be lost: move it", file=file, code="index_wrong")
     for dataset in datasets[1:]:
-        found = format_differences(datasets[0].info, dataset.info) + _camera_differences(datasets[0], dataset)
+        cameras = (each.episodes[0].info["cameras"] for each in (datasets[0], dataset))
+        found = [*format_differences(datasets[0].info, dataset.info), *camera_differences(*cameras)]
         if found:
             raise CommandError(
                 f"{datasets[0].root} (there) and {dataset.root} (here) differ: {'; '.join(found)}",
@@ -270,15 +271,6 @@ def _sources(
     if len(sources) > CHUNK * CHUNK:
         raise CommandError(f"{len(sources)} episodes are too many for one dataset", code="too_many")
     return sources
-
-
-def _camera_differences(one: Dataset, other: Dataset) -> list[str]:
-    """Return the differences in the stored depth and streams, which ``meta/info.json`` does not show."""
-    there, here = (
-        {name: (camera.get("depth_unit_m"), camera.get("streams")) for name, camera in info.items()}
-        for info in (one.episodes[0].info["cameras"], other.episodes[0].info["cameras"])
-    )
-    return [] if there == here else [f"depth and streams are {there} there, and {here} here"]
 
 
 # The result: file by file, each a link where it stays as it is.
