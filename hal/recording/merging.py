@@ -28,7 +28,7 @@ from .changing import existing_episodes, refuse_foreign
 from .checking import camera_differences, format_differences
 from .codecs import Stats, column_stats, copy_records, merge_stacked, merge_stats, stats_as_lists
 from .dataset import Dataset, Episode
-from .finish import entries_table, entry_row, last_row, new_info, stats_of, stats_row, tasks_table, write_table
+from .finish import entries_table, entry_row, last_row, new_info, stats_of, stats_row, tasks_table, totals, write_table
 from .index import check_next_episode, read_entries, read_stats, read_table, read_tasks, stray_files
 from .layout import (
     CHUNK,
@@ -334,8 +334,7 @@ class DatasetBuilder:
         write_table(self.layout.tasks, tasks_table(self.tasks), keep_schema=True)
         write_json(self.layout.stats, stats_as_lists({key: merge_stats(found) for key, found in parts.items()}))
         info = new_info(self.features, self.fps, self.sources[0].episode._meta["robot_type"])
-        counts = {"total_episodes": count, "total_frames": self.starts[-1], "total_tasks": len(self.tasks)}
-        write_json(self.layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
+        write_json(self.layout.info, info | totals(count, self.starts[-1], len(self.tasks)))
 
     # Videos.
 

@@ -52,7 +52,7 @@ def select_episodes(
     numbers = range(len(dataset)) if wanted is None else wanted
     chosen = existing_episodes(dataset, parse_episodes(numbers) if isinstance(numbers, str) else numbers)
     found = [dataset.episodes[number] for number in sorted(chosen)]
-    found = [episode for episode in found if episode.success or not successful_only]
+    found = [episode for episode in found if not successful_only or episode.success]
     if not found:
         raise CommandError("none of these episodes is marked a success", code="no_episodes")
     return tuple(found)
