@@ -460,9 +460,10 @@ def _panel(canvas: SheetCanvas, content: EpisodeContent, curve: _Curve, left: fl
         canvas.line([(x, top), (x, top + _PANEL)], LIGHT)
         canvas.text(x, top + _PANEL + 3, f"{tick:g} s", 11, GREY, "ma")
     for values, colour, thick in ((curve.commanded, _COMMANDED, 3.0), (curve.measured, _MEASURED, 1.4)):
-        for part in np.ma.clump_unmasked(np.ma.masked_invalid(values)):
-            times = content.grid[part].tolist()
-            canvas.line(list(map(at, times, values[part].tolist())), colour, thick)
+        edges = np.flatnonzero(np.diff(np.isfinite(values), prepend=False, append=False))
+        for start, end in edges.reshape(-1, 2):  # a run of rows that hold a number
+            points = zip(content.grid[start:end].tolist(), values[start:end].tolist(), strict=True)
+            canvas.line([at(t, value) for t, value in points], colour, thick)
 
 
 def _range(curve: _Curve) -> tuple[float, float]:
