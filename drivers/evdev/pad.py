@@ -12,11 +12,11 @@ from types import MappingProxyType
 
 from pydantic import BaseModel, ConfigDict
 
-from hal.config.files import Problems
+from hal.config.files import Problems, check_record
 from hal.config.models import load_pad_models
 from hal.driver import GamepadDriver, PadReading, Plugged
 from hal.errors import NotSupported
-from hal.pads.model import PadModel, check_record, choose_model, guess_model, guess_warning, pad_model
+from hal.pads.model import PadModel, choose_model, guess_model, guess_warning, pad_model
 from hal.specs import PadSpec
 from hal.types import AXES
 

@@ -23,11 +23,12 @@ from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from hal.config.files import check_record
 from hal.driver import GamepadDriver, PadReading
 from hal.errors import ConfigError, ConnectionLost, Problem
 from hal.pads.codes import ABS, ABS_NAME, EV_ABS, EV_KEY, KEY, KEY_NAME
 from hal.pads.mapper import AxisRange, PadMapper
-from hal.pads.model import PadModel, check_record, pad_model
+from hal.pads.model import PadModel, pad_model
 from hal.specs import PadSpec
 
 Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
