@@ -159,30 +159,6 @@ def test_polling_thread_plays_the_rumble(system: FakeInput, make_pad: MakePad, k
     assert len(kernel.effects) == 1, "nothing is uploaded to play it"
 
 
-def test_poll_does_not_wait_for_an_upload(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
-    node = system.plug(DS4)
-    node.can_rumble = True
-    pad = make_pad()
-    wait_until(lambda: kernel.effects)
-    kernel.answer.clear()  # the kernel does not answer the next upload for 10 s
-
-    def told() -> bool:
-        began = time.monotonic()
-        Gamepad(pad).rumble(strong=0.1)
-        poll(pad)
-        assert time.monotonic() - began < 2.0
-        return kernel.asked == 2
-
-    wait_until(told)
-    for _ in range(5):
-        began = time.monotonic()
-        assert poll(pad).connected
-        assert time.monotonic() - began < 2.0
-    assert len(kernel.effects) == 1, "the upload is under way"
-    kernel.answer.set()
-    wait_until(lambda: len(kernel.effects) == 2)
-
-
 def test_read_only_or_absent_pad_does_not_rumble(system: FakeInput, make_pad: MakePad) -> None:
     pad = make_pad()
     assert not Gamepad(pad).rumble()
