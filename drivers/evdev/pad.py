@@ -91,7 +91,6 @@ class EvdevPad(GamepadDriver):
         self._scan(self._finder)
 
     def poll(self, now: float, timeout: float) -> PadReading:
-        """See :meth:`GamepadDriver.poll`."""
         finder = self._finder
         if finder is None or not self._is_open:
             return self._last
@@ -249,7 +248,6 @@ class EvdevPad(GamepadDriver):
 
     @property
     def control_names(self) -> Mapping[str, str]:
-        """See :meth:`GamepadDriver.control_names`."""
         return self._link.model.control_names if self._link is not None else {}
 
     def describe(self) -> str:
