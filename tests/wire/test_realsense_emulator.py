@@ -157,12 +157,6 @@ def test_jitter_delays_the_arrival_and_not_the_stamp(make_bench) -> None:
 # Recordings.
 
 
-def test_a_recording_without_metadata_mixes_frames(tmp_path: Path) -> None:
-    path = tmp_path / "bare.db3"
-    write_recording(path, VGA, 40, metadata=False)
-    assert any(len({picture.number for picture in found.values()}) > 1 for found in played(path))
-
-
 def test_a_recording_may_have_gaps_and_overwrites_no_file(tmp_path: Path) -> None:
     path = tmp_path / "gaps.db3"
     write_recording(path, replace(VGA, streams=("depth",)), 20, lost=(7, 8, 15))
