@@ -107,7 +107,6 @@ class PlaybackPad(GamepadDriver):
         raise ConfigError([Problem(file, "line 1", message, code="unknown_model")])
 
     def poll(self, now: float, timeout: float) -> PadReading:
-        """See :meth:`GamepadDriver.poll`."""
         mapper = self._mapper
         if mapper is None:
             raise ConnectionLost(f"the recording {self._options.file.name} is not open", code="not_open")
@@ -187,11 +186,9 @@ class PlaybackPad(GamepadDriver):
 
     @property
     def control_names(self) -> Mapping[str, str]:
-        """See :meth:`GamepadDriver.control_names`."""
         return self._mapper.model.control_names if self._mapper is not None else {}
 
     def describe(self) -> str:
-        """See :meth:`GamepadDriver.describe`."""
         return f"replaying {self._options.file.name}"
 
     def close(self) -> None:
