@@ -13,7 +13,7 @@ import argparse
 import math
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import hal
 from hal.apps._common import (
@@ -30,10 +30,11 @@ from hal.apps._gripper_zero import find_zero, gripper_parser
 from hal.errors import CommandError
 
 if TYPE_CHECKING:
-    from hal.calibration import Board, Calibration, Collector, LensViews, RigFileOutput
+    from hal.calibration import Board, Calibration, Collector, LensFit, LensViews, RigFileOutput
     from hal.camera import Camera
     from hal.geometry import Pose
     from hal.rig import Rig
+    from hal.specs import CameraSpec
 
 VIEWS = 20
 
@@ -155,18 +156,19 @@ def _measure_lens(args: argparse.Namespace) -> int:
         raise CommandError(f"--views must be at least {calibration.LEAST_PICTURES}, not {args.views}")
     plan = load(**config_options(args)).resolve()
     spec = choose_spec("camera", args.camera, {camera.name: camera for camera in plan.cameras})
-    if plan.engine == spec.driver:
-        raise CommandError(
-            f"camera {spec.name} is simulated, and its intrinsics are exact; add --real", code="simulated"
-        )
     output = None if args.compare else calibration.RigFileOutput.of(plan.source, args.out, spec.name)
     if output is not None:
         size = f"width: {spec.capture_width}, height: {spec.capture_height}"
         output.check("intrinsics", f"{{{size}, fx: 1, fy: 1, cx: 0, cy: 0}}")
+    driver = registry.load(spec.driver, "camera")
+    if driver.simulated:
+        raise CommandError(
+            f"camera {spec.name} is simulated, and its intrinsics are exact; add --real", code="simulated"
+        )
     views = calibration.LensViews(calibration.Detector(_board(args)))
     options = {name: value for name, value in spec.options.items() if name != "undistort"}
     raw = replace(spec, width=spec.capture_width, height=spec.capture_height, options=options)
-    camera = Camera(registry.load(spec.driver, "camera")(raw, RealClock()), RealClock(), threaded=True)
+    camera = Camera(driver(raw, RealClock()), RealClock(), threaded=True)
     try:
         camera.open()
         _take_pictures(camera, views, args.views)
@@ -175,11 +177,25 @@ def _measure_lens(args: argparse.Namespace) -> int:
     finally:
         camera.close()
     found = views.solve()
-    (fx, _, cx), (_, fy, cy), _ = found.K
-    numbers = [f"{value:.1f} +- {std:.1f}" for value, std in zip((fx, fy, cx, cy), found.std, strict=True)]
-    print(f"\nfx, fy, cx, cy: {', '.join(numbers)} px; corners off by {found.error_px:.2f} px ({found.views} views)")
+    print("\n".join(["", *lens_lines(spec, found)]))
     print("\n".join(f"WARNING: {text}" for text in found.doubts))
     return _write(args, output, plan.source, spec.name, ("intrinsics", found.entry()), found.doubts)
+
+
+def lens_lines(old: CameraSpec, new: LensFit) -> list[str]:
+    """Return the new intrinsics, and those that the rig file's captured images have now, for a terminal."""
+
+    def numbers(K: Any, std: Any, distortion: Any) -> str:
+        (fx, _, cx), (_, fy, cy), _ = K
+        four = ", ".join(f"{value:.1f}{added}" for value, added in zip((fx, fy, cx, cy), std, strict=True))
+        return f"fx, fy, cx, cy: {four} px; distortion: {', '.join(f'{value:.4f}' for value in distortion)}"
+
+    K = old.sensors["color"].K if "color" in old.sensors else old.K
+    return [
+        f"{'rig file':12s}{numbers(K, [''] * 4, old.distortion)}",
+        f"{'new':12s}{numbers(new.K, [f' +- {std:.1f}' for std in new.std], new.distortion)}",
+        f"corners off by {new.error_px:.2f} px ({new.views} views)",
+    ]
 
 
 def _take_pictures(camera: Camera, views: LensViews, wanted: int) -> None:
@@ -218,6 +234,8 @@ def _main(args: argparse.Namespace) -> int:
     guess = calibration.initial_guess(setup, args.guess) if args.auto else None
     board = _board(args)
     output = None if args.compare else calibration.RigFileOutput.of(plan.source, args.out, setup.camera)
+    if output is not None:
+        output.check(*setup.entry(hal.Pose()))
     where = f"on {setup.link_name} of" if setup.eye == "in-hand" else "beside"
     task = f"task     camera {setup.camera} {where} {setup.robot}; board of {board}"
     if args.dry_run:
@@ -313,10 +331,11 @@ def _write(
     from hal.calibration import CalibrationFailed
 
     key, value = entry
+    print(f"\ncameras.{camera} of {source if output is None else output.path}:\n  {key}: {value}", flush=True)
     if output is None:
-        print("" if args.compare else f"not written: {source} is built in; --out my_rig.yaml writes a copy")
+        if not args.compare:
+            print(f"not written: {source} is built in; --out my_rig.yaml writes a copy")
         return 0
-    print(f"\ncameras.{camera} of {output.path}:\n  {key}: {value}", flush=True)
     if args.yes and doubts:
         raise CalibrationFailed(
             f"not written: a doubtful result is not written with --yes, run without it to confirm: {'; '.join(doubts)}",

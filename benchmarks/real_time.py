@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -91,36 +93,40 @@ def drive_without_right(*arguments: Any) -> dict[str, Any]:
 
 
 def follow_stick(rate_hz: float, presses: int, woken: bool) -> list[float]:
-    """Return times from the motion of a stick to the first set-point that moves, s, of a loop of 50 Hz."""
+    """Return times from the motion of a stick to the first set-point that moves, s, of a loop of 50 Hz.
+
+    It is infinite where none moves within 0.1 s.
+    """
     overrides = ["cameras={}", f"simulation.physics_hz={rate_hz:g}", "gamepads.pad={model: auto, driver: mock}"]
     with hal.open("panda_table", sim=True, clock="real_time", overrides=overrides) as rig:
-        arm, pad, found, changed = rig.robots["panda"], rig.gamepads["pad"], [], threading.Event()
+        arm, pad, changed = rig.robots["panda"], rig.gamepads["pad"], threading.Event()
         pad.wake(changed)
-        teleop, mover = hal.Teleop(arm), threading.Thread(target=_move_stick, args=(rig, presses, found))
-        with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
-            mover.start()
+        teleop = hal.Teleop(arm)
+        with ThreadPoolExecutor(1) as pool, arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
+            moved = pool.submit(_move_stick, rig, presses)
             for tick in rig.clock.rate(50, changed if woken else None):
                 with contextlib.suppress(MotionStopped):
                     control.send(teleop.step(pad.state(), tick.dt)[0])
-                if not mover.is_alive():
+                if moved.done():
                     break
-    return found
+        return moved.result()
 
 
-def _move_stick(rig: hal.Rig, presses: int, found: list[float]) -> None:
-    arm, pad, dice = rig.robots["panda"], rig.driver("pad"), np.random.default_rng(1)
-    while len(found) < presses:
+def _move_stick(rig: hal.Rig, presses: int) -> list[float]:
+    arm, pad, dice, found = rig.robots["panda"], rig.driver("pad"), np.random.default_rng(1), []
+    for k in range(presses):
         if arm.state(max_age=5.0).status is not hal.RobotStatus.FOLLOWING:
             pad.release("l2")
             time.sleep(0.1)
             pad.press("l2")
         time.sleep(0.2 + 0.02 * dice.random())  # at rest, and not in step with the loop
         begun = time.monotonic()
-        pad.stick("left_x", 1.0)
+        pad.stick("left_x", (-1.0) ** k)  # to and fro, so that no limit stops the arm
         time.sleep(0.1)
         moved = [state.stamp.t for state in arm.states(begun) if abs(state.dq_set).max() > 1e-6]
         pad.stick("left_x", 0.0)
-        found += [moved[0] - begun] if moved else []
+        found.append(moved[0] - begun if moved else math.inf)
+    return found
 
 
 def run(quick: bool) -> Iterator[Table]:

@@ -9,6 +9,7 @@ import os
 import resource
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from .errors import HalError
 from .specs import CameraSpec, GripperSpec, RobotSpec
 
 if TYPE_CHECKING:
+    from .driver import CameraDriver
     from .specs import Plan
 
 Level = Literal["ok", "warn", "fail", "unknown"]
@@ -124,6 +126,47 @@ def _check(device: Device, duration: float) -> Iterator[CheckResult]:
         yield from check(device, duration)
     except (HalError, OSError) as error:
         yield CheckResult("check", "fail", f"{type(error).__name__}: {error}", "fix this first, then check again")
+
+
+# For the checks of drivers
+
+_FIRST, _GRAB = 5.0, 0.2
+"""Longest time until the first frame of a camera, and of one wait for a later one, s."""
+_SLOW, _LOSSY = 0.95, 0.02
+"""Share of the nominal rate below which, and share of lost frames above which something is wrong."""
+
+
+def check_frames(driver: CameraDriver, duration: float, slow: str, lossy: str, silent: str) -> CheckResult:
+    """Measure the rate of an open camera's frames, and the share that is lost.
+
+    Args:
+        driver: The camera.
+        duration: How long frames are counted, s.
+        slow: Remedy if the camera takes too few.
+        lossy: Remedy if they are lost on their way.
+        silent: Remedy if none arrive.
+    """
+    nominal = min((stream.rate_hz for stream in driver.info.streams.values()), default=driver.spec.rate_hz)
+    try:
+        first = driver.grab(_FIRST)
+        if first is None:
+            return CheckResult("frames", "fail", "no frame arrived", silent)
+        frames, last, end = 0, first, time.monotonic() + duration
+        while time.monotonic() < end:
+            if (frame := driver.grab(_GRAB)) is not None:
+                frames, last = frames + 1, frame
+    except HalError as error:
+        return CheckResult("frames", "fail", str(error), silent)
+    taken, passed = last.seq - first.seq, max(last.t - first.t, 1e-9)
+    lost = taken - frames
+    found = f"{frames / passed:.1f} of {nominal:g} Hz, {lost} of {taken} lost"
+    if driver.tally.mismatched:
+        found += f", {driver.tally.mismatched} frame sets that do not match"
+    if taken / passed < _SLOW * nominal:
+        return CheckResult("frames", "warn", found, slow)
+    if lost > _LOSSY * taken:
+        return CheckResult("frames", "warn", found, lossy)
+    return CheckResult("frames", "ok", found)
 
 
 # This computer

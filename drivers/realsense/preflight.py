@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
 from hal.driver import CameraInfo
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, HalError, NotSupported
-from hal.preflight import CheckResult
+from hal.preflight import CheckResult, check_frames
 from hal.specs import CameraSpec
 
 from .camera import RealSenseCamera
 
-_GRAB = 0.2
-"""s that one wait for a frame takes at most."""
-_SETTLE = 5.0
-"""s for the first frame to come."""
-_SLOW = 0.95
-"""Share of the nominal rate below which something is wrong."""
 _CABLE = "plug it into a USB 3 port (blue, or marked SS) of the computer itself, with the cable that came with it"
 _LOAD = "use a USB 3 port of its own, fewer or smaller streams, or a computer with less load"
 _DARK = "add light, or set color.auto_exposure_priority to 0: in the dark the camera lowers its frame rate"
@@ -52,7 +45,7 @@ def preflight(spec: CameraSpec, duration: float) -> Iterator[CheckResult]:
         info = driver.info
         yield CheckResult("camera", "ok", f"{info.title}, serial {info.serial}, firmware {info.firmware}")
         yield _check_link(info)
-        yield _check_frames(driver, spec, duration)
+        yield check_frames(driver, duration, slow=_DARK, lossy=_LOAD, silent=_REMEDIES[ConnectionLost])
     finally:
         driver.close()
 
@@ -63,34 +56,3 @@ def _check_link(info: CameraInfo) -> CheckResult:
     if info.usb.startswith("2"):
         return CheckResult("USB", "warn", f"USB {info.usb}: fewer modes, and frames get lost", _CABLE)
     return CheckResult("USB", "ok", f"USB {info.usb}")
-
-
-def _check_frames(driver: RealSenseCamera, spec: CameraSpec, duration: float) -> CheckResult:
-    """Measure the rate of the captures, and the share that is lost."""
-    nominal = min((stream.rate_hz for stream in driver.info.streams.values()), default=spec.rate_hz)
-    deadline = time.monotonic() + _SETTLE
-    first = last = None
-    frames, start = 0, 0.0
-    try:
-        while first is None and time.monotonic() < deadline:
-            first = driver.grab(_GRAB)
-        if first is None:
-            return CheckResult("frames", "fail", "no frame arrived", _REMEDIES[ConnectionLost])
-        start, last = time.monotonic(), first
-        while time.monotonic() - start < duration:
-            frame = driver.grab(_GRAB)
-            if frame is not None:
-                frames, last = frames + 1, frame
-    except ConnectionLost as error:
-        return CheckResult("frames", "fail", str(error), _REMEDIES[ConnectionLost])
-    passed = last.t - first.t
-    rate = frames / passed if passed > 0.0 else 0.0
-    lost = last.seq - first.seq - frames
-    found = f"{rate:.1f} of {nominal:g} Hz, {lost} of {frames + lost} lost"
-    if driver.tally.mismatched:
-        found += f", {driver.tally.mismatched} frame sets that do not match"
-    if rate < _SLOW * nominal and not lost:
-        return CheckResult("frames", "warn", found, _DARK)
-    if rate < _SLOW * nominal or lost > 0.02 * (frames + lost):
-        return CheckResult("frames", "warn", found, _LOAD)
-    return CheckResult("frames", "ok", found)

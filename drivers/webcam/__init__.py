@@ -13,7 +13,7 @@ V4L2 = DriverSpec(
     name="v4l2",
     camera="hal.drivers.webcam.capture:V4l2Camera",
     checks={"camera": "hal.drivers.webcam.settings:check_v4l2"},
-    camera_preflight="hal.drivers.webcam.capture:preflight",
+    camera_preflight="hal.drivers.webcam.preflight:check_v4l2",
     requires=_REQUIRES,
 )
 
@@ -21,6 +21,7 @@ VIDEO = DriverSpec(
     name="video",
     camera="hal.drivers.webcam.video:VideoCamera",
     checks={"camera": "hal.drivers.webcam.settings:check_video"},
+    camera_preflight="hal.drivers.webcam.preflight:check_video",
     path_options=frozenset({"file"}),
     requires=_REQUIRES,
 )

@@ -6,14 +6,17 @@ import errno
 import logging
 import mmap
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from ctypes import c_int32
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, HalError, NotSupported
-from hal.preflight import CheckResult
 from hal.specs import CameraSpec
 
 from . import kernel
@@ -27,6 +30,8 @@ _FIRST = 5.0
 """Longest time until the first frame of a camera, s."""
 _OLDEST, _AHEAD = 10.0, 1e-3
 """Greatest age of a frame that is read, and by how much its stamp may be ahead, s; others are of another clock."""
+_GONE = (errno.ENODEV, errno.ENXIO, errno.ENOENT)
+"""Errors of a device that was unplugged."""
 _RIGHTS = "no permission to open it; sudo usermod -aG video $USER, then log out and in"
 
 
@@ -110,41 +115,48 @@ class V4l2Camera(CameraDriver):
             except OSError as error:
                 raise _explain(error, f"camera {self.spec.name}") from error
             now = time.monotonic()
-            if buffer is None:
-                if now - self._heard > self._patience:
-                    why = self._trouble or "it sends nothing; unplug it and plug it in again, or use another USB port"
-                    text = f"no frame of camera {self.spec.name} for {now - self._heard:.1f} s: {why}"
-                    raise ConnectionLost(text, code="stalled")
-                if now >= deadline:
-                    return None
-            elif (frame := self._make_frame(*buffer, now)) is not None:
+            if buffer is not None and (frame := self._make_frame(*buffer, now)) is not None:
                 return frame
+            if now - self._heard > self._patience:
+                why = self._trouble or "it sends nothing; unplug it and plug it in again, or use another USB port"
+                text = f"no frame of camera {self.spec.name} for {now - self._heard:.1f} s: {why}"
+                raise ConnectionLost(text, code="stalled")
+            if now >= deadline:
+                return None
 
     def _dequeue_newest(self, node: VideoNode, timeout: float) -> tuple[Buffer, bytes] | None:
         """Return the newest frame, as the kernel has it; those before it are the gaps in their numbers."""
         newest: tuple[Buffer, bytes] | None = None
-        while node.wait(timeout if newest is None else 0.0):
+        for _ in self._maps:  # not for ever, if frames come faster than they are decoded
+            if not node.wait(timeout if newest is None else 0.0):
+                break
             buffer = _make_buffer()
             try:
                 node.call(kernel.DEQUEUE, buffer)
             except BlockingIOError:
                 break
             if newest is not None and self._decoder.sequential:
-                self._make_frame(*newest, time.monotonic())
+                self._decode(*newest)
             newest = buffer, self._maps[buffer.index][: buffer.bytesused]
             node.call(kernel.QUEUE, _make_buffer(buffer.index))
         return newest
 
-    def _make_frame(self, buffer: Buffer, data: bytes, now: float) -> RawFrame | None:
-        """Return the frame of a buffer; None if it is damaged, so that its number is missing."""
+    def _decode(self, buffer: Buffer, data: bytes) -> NDArray[np.uint8] | None:
+        """Return the captured image of a buffer; None if it is damaged."""
         try:
             if buffer.flags & kernel.DAMAGED:
                 raise ValueError("the kernel reports damaged frames: use another USB port or cable")
-            image = self._output.finish(self._decoder.decode(data))
+            return self._decoder.decode(data)
         except ValueError as error:
             if str(error) != self._trouble:
                 _LOG.warning("camera %s: %s", self.spec.name, error)
             self._trouble = str(error)
+            return None
+
+    def _make_frame(self, buffer: Buffer, data: bytes, now: float) -> RawFrame | None:
+        """Return the frame of a buffer; None if it is damaged, so that its number is missing."""
+        image = self._decode(buffer, data)
+        if image is None:
             return None
         self._heard, self._patience = now, self._settings.stall_s
         stamped = buffer.flags & kernel.CLOCK == kernel.MONOTONIC
@@ -155,7 +167,7 @@ class V4l2Camera(CameraDriver):
                 how = "echo CLOCK_MONOTONIC | sudo tee /sys/module/uvcvideo/parameters/clock"
                 _LOG.warning("camera %s: %s; %s", self.spec.name, why, how)
             self._misdated, t = True, now
-        return RawFrame(t, t, buffer.sequence, color=image)
+        return RawFrame(t, t, buffer.sequence, color=self._output.finish(image))
 
     def close(self) -> None:
         node, self._node = self._node, None
@@ -171,7 +183,7 @@ def _make_buffer(index: int = 0) -> Buffer:
 
 
 def _explain(error: OSError, what: str) -> HalError:
-    if error.errno in (errno.ENODEV, errno.ENXIO, errno.ENOENT):
+    if error.errno in _GONE:
         return ConnectionLost(f"{what} was unplugged", code="unplugged")
     if error.errno == errno.EBUSY:
         return ControlTaken(f"{what} is in use by another program: end it", code="device_busy")
@@ -192,22 +204,16 @@ def _describe_modes(camera: FoundCamera, node: VideoNode) -> str:
 def _list_captures(
     cameras: list[FoundCamera], describe: Callable[[FoundCamera, VideoNode], str]
 ) -> dict[FoundCamera, str]:
-    """Return those nodes that capture images, each with its description."""
+    """Return those nodes that capture images, each with its description, or with the reason why it has none."""
     found = {}
     for camera in cameras:
         try:
-            node = VideoNode(camera.path)
+            with closing(VideoNode(camera.path)) as node:
+                if kernel.is_capture(node):
+                    found[camera] = describe(camera, node)
         except OSError as error:
-            if isinstance(error, PermissionError):
-                found[camera] = f"{camera}: {_RIGHTS}"
-            continue  # it is being unplugged
-        try:
-            if kernel.is_capture(node):
-                found[camera] = describe(camera, node)
-        except OSError:
-            continue
-        finally:
-            node.close()
+            if error.errno not in _GONE:
+                found[camera] = str(_explain(error, str(camera)))
     return found
 
 
@@ -300,40 +306,3 @@ def _get(node: VideoNode, id: int) -> float | None:
     except OSError:
         return None
     return float(record.value)
-
-
-def preflight(spec: CameraSpec, duration: float) -> Iterator[CheckResult]:
-    """Open the camera, measure its frames, and close it.
-
-    Args:
-        spec: The camera's record.
-        duration: How long frames are counted, s.
-
-    Yields:
-        One result for the camera, and one for its frames.
-    """
-    driver = V4l2Camera(spec)
-    try:
-        driver.open()
-        info = driver.info
-        serial = f'serial "{info.serial}"' if info.serial else "no serial"
-        yield CheckResult("camera", "ok", f"{info.title}, {serial}")
-        first = driver.grab(_FIRST)
-        if first is None:
-            yield CheckResult("frames", "fail", "no frame arrived", "unplug it and plug it in again")
-            return
-        frames, last, end = 0, first, time.monotonic() + duration
-        while time.monotonic() < end:
-            if (frame := driver.grab(0.2)) is not None:
-                frames, last = frames + 1, frame
-    except HalError as error:
-        yield CheckResult("camera", "fail", str(error))
-        return
-    finally:
-        driver.close()
-    rate, lost = frames / max(last.t - first.t, 1e-9), last.seq - first.seq - frames
-    text = f"{rate:.1f} of {spec.rate_hz:g} Hz, {lost} of {frames + lost} lost"
-    if rate > 0.95 * spec.rate_hz and lost <= 0.02 * frames:
-        yield CheckResult("frames", "ok", text)
-        return
-    yield CheckResult("frames", "warn", text, "add light, or set exposure_s: many cameras slow down in the dark")

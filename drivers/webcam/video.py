@@ -136,6 +136,7 @@ class VideoCamera(CameraDriver):
             )
         except Exception as error:
             end = ConnectionLost(f"camera {self.spec.name}: {error}", code="device_error")
+            end.__cause__ = error
         with self._news:
             if closing is self._closing:
                 self._end = end

@@ -156,7 +156,7 @@ def _check_link(arm: RobotSpec, link: str) -> None:
 
 
 class RigFileOutput:
-    """The rig's file that a result is written to. It is checked before the arm moves.
+    """The rig's file that a result is written to; ``check`` it before the views are taken.
 
     Args:
         source: The rig's file.
@@ -164,8 +164,7 @@ class RigFileOutput:
         camera: Name of the camera.
 
     Raises:
-        CommandError: The folder is missing, or the file cannot be edited.
-        OSError: The file cannot be read.
+        CommandError: The folder is missing.
     """
 
     @classmethod
@@ -183,14 +182,13 @@ class RigFileOutput:
         self.source, self.path, self.camera = source, path, camera
         if not self.path.resolve().parent.is_dir():
             raise CommandError(f"there is no folder {self.path.resolve().parent}", code="no_folder")
-        self._replace_place("pose", "[0, 0, 0, 0, 0, 0, 1]")
 
-    def _replace_place(self, key: str, value: str) -> str:
-        return replace_camera_place(self.source.read_bytes().decode("utf-8"), self.camera, key, value)
+    def _replace_entry(self, key: str, value: str) -> str:
+        return replace_camera_entry(self.source.read_bytes().decode("utf-8"), self.camera, key, value)
 
     def check(self, key: str, value: str) -> str:
         """Return the file's text with the entry; raises as :meth:`write`."""
-        text = self._replace_place(key, value)
+        text = self._replace_entry(key, value)
         trial = self.path.resolve().with_name(f".{self.path.name}.trial.yaml")
         try:
             write_file(trial, text)
@@ -217,7 +215,7 @@ class RigFileOutput:
         return [*messages, f"written: {self.path}"]
 
 
-def replace_camera_place(text: str, camera: str, key: str, value: str) -> str:
+def replace_camera_entry(text: str, camera: str, key: str, value: str) -> str:
     """Replace a camera's place, or another key, in the text of a rig's file; every other character stays as it is.
 
     Libraries that edit YAML (ruamel.yaml) rewrite indentation, quotes, line ends and aligned comments elsewhere in a

@@ -473,18 +473,23 @@ class TrajectoryPlayer:
     def _waits_for_fingers(self, now: float) -> bool:
         """Return whether the arm has to rest because the fingers, unlike the recorded ones, do not rest yet."""
         gripper, grip = self.robot.gripper, self.trajectory.grip_at(self.progress)
-        if gripper is None or grip is None or gripper.trouble or not self._waits or self.progress < self._waits[0]:
+        if gripper is None or grip is None or not self._waits or self.progress < self._waits[0]:
             return False
-        state = gripper.state()
-        taken = abs(state.width_target - min(grip[0], gripper.width_max)) <= _MOVED
-        open_yet = state.moving or state.outcome in (GripperOutcome.RUNNING, GripperOutcome.STOPPED)  # by a pause
-        if taken and not open_yet:
-            self._waits = [wait for wait in self._waits if wait > self.progress]
-            self._wait_ends = math.inf
-            return False
+        trouble, state = gripper.trouble, gripper.peek()
+        if state is not None:
+            if state.outcome is GripperOutcome.FAILED:
+                cause = f"{gripper.name} failed, while the arm waits for its fingers: {state.fault}"
+                raise RobotFault(cause, "clear the gripper's fault, and replay again")
+            taken = abs(state.width_target - min(grip[0], gripper.width_max)) <= _MOVED
+            open_yet = state.moving or state.outcome in (GripperOutcome.RUNNING, GripperOutcome.STOPPED)  # by a pause
+            if taken and not open_yet and not trouble:
+                self._waits = [wait for wait in self._waits if wait > self.progress]
+                self._wait_ends = math.inf
+                return False
+            trouble = trouble or f"{state.width:.4f} m"
         self._wait_ends = min(self._wait_ends, now + _LONGEST_WAIT)
         if now > self._wait_ends:
-            cause = f"{gripper.name} does not come to rest, as it did in the recording: {state.width:.4f} m"
+            cause = f"{gripper.name} does not come to rest, as it did in the recording: {trouble}"
             raise RobotFault(cause, "see what is in the way of the fingers")
         return True
 

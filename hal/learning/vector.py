@@ -194,7 +194,8 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
         except (TypeError, ValueError) as error:
             raise CommandError(f"actions are numbers: {error}", code="bad_action") from None
         answers = self._request("step", [{}] * len(self._parts))
-        infos: dict[str, Any] = {"elapsed": steps["elapsed"].copy(), "_elapsed": np.ones(self.num_envs, bool)}
+        elapsed = steps["elapsed"].copy()
+        infos: dict[str, Any] = {"elapsed": elapsed, "_elapsed": ~np.isnan(elapsed)}
         for part, answer in zip(self._parts, answers, strict=True):
             if answer is not None:
                 infos = self._infos(_unpack(answer), infos, part.start)
@@ -385,12 +386,10 @@ class _Worlds:
         return 0.0
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
-        """Call a method of every world, or read an attribute."""
         found = [env.get_wrapper_attr(name) for env in self._envs]
         return self._run_each(lambda k: found[k](*args, **kwargs) if callable(found[k]) else found[k])
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """Set an attribute of every world."""
         for env, value in zip(self._envs, values, strict=True):
             env.set_wrapper_attr(name, value)
 

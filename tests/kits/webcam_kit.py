@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import mmap
+import os
 import shutil
 import time
 from collections import deque
@@ -19,8 +20,8 @@ import numpy as np
 from hal.drivers.webcam import capture, kernel
 from hal.drivers.webcam.kernel import fourcc
 
-YUYV, MJPEG = fourcc("YUYV"), fourcc("MJPG")
-MODES = {(YUYV, 64, 48): (30, 60), (MJPEG, 64, 48): (30, 60, 90), (MJPEG, 128, 96): (30,)}
+YUYV, MJPEG, H264 = fourcc("YUYV"), fourcc("MJPG"), fourcc("H264")
+MODES = {(YUYV, 64, 48): (30, 60), (MJPEG, 64, 48): (30, 60, 90), (MJPEG, 128, 96): (30,), (H264, 64, 48): (120,)}
 BRIGHTNESS, GAIN, AUTOGAIN = 0x980900, 0x980913, 0x980912
 CONTROLS = {
     BRIGHTNESS: (b"Brightness", 1, -64, 64, 0),
@@ -56,7 +57,8 @@ class FakeWebcam:
             (self.usb / "serial").write_text(f"{serial}\n")
         self.values = {id: control[4] for id, control in CONTROLS.items()}
         self.plugged = self.frozen = False
-        self.denied = False
+        self.refused = 0
+        """Number of the error with which it refuses to be opened."""
         self.clock_offset = 0.0
         """How far its clock is ahead of the monotonic one, s."""
         self.damaged: set[int] = set()
@@ -87,6 +89,8 @@ class FakeNode:
         self.memories: list[mmap.mmap] = []
         self.queued: deque[int] = deque()
         self.done: deque[tuple[int, int, float, int]] = deque()  # index, number, time, bytes
+        self.encoder: Any = None
+        """Of H.264, in which a frame depends on those before it."""
         self.answers = {
             kernel.QUERY_CAPABILITY: self.query,
             kernel.LIST_FORMATS: self.list_formats,
@@ -173,6 +177,12 @@ class FakeNode:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
         if code == YUYV:
             return bytes(frame.reformat(format="yuyv422").planes[0])
+        if code == H264:
+            if self.encoder is None:
+                self.encoder = av.CodecContext.create("libx264", "w")
+                self.encoder.width, self.encoder.height, self.encoder.framerate = width, height, 120
+                self.encoder.pix_fmt, self.encoder.options = "yuv420p", {"tune": "zerolatency"}
+            return b"".join(map(bytes, self.encoder.encode(frame)))
         context = av.CodecContext.create("mjpeg", "w")
         context.width, context.height, context.pix_fmt, context.framerate = width, height, "yuvj420p", 30
         return b"".join(map(bytes, [*context.encode(frame), *context.encode()]))
@@ -212,8 +222,8 @@ def webcams(root: Path, *cameras: dict[str, str]) -> Iterator[list[FakeWebcam]]:
     def open_node(path: str) -> FakeNode:
         for camera in made:
             if camera.path == path and camera.plugged:
-                if camera.denied:
-                    raise PermissionError(errno.EACCES, "EACCES")
+                if camera.refused:
+                    raise OSError(camera.refused, os.strerror(camera.refused))
                 return FakeNode(camera)
         raise fail(errno.ENOENT)
 

@@ -302,11 +302,16 @@ def test_a_thin_rod_casts_a_shadow(tmp_path: Path) -> None:
     """All of its corners are within one cell of the coarse mesh that casts shadows."""
     rod = '<visual><origin xyz="0.02 0.02 0"/><geometry><cylinder radius="0.005" length="0.5"/></geometry></visual>'
     (tmp_path / "rod.urdf").write_text(f'<robot name="rod"><link name="base">{rod}</link></robot>')
-    eye = {"model": "pinhole", "capture": {"width": 64, "height": 64, "rate_hz": 30}, "pose": {"position": [0, 0, 2]}}
-    things = [{"name": "rod", "urdf": str(tmp_path / "rod.urdf"), "position": [0, 0, 1], "fixed": True}]
+    down = {"position": [0, 0, 2], "orientation": [1, 0, 0, 0]}
+    eye = {"model": "pinhole", "capture": {"width": 64, "height": 64, "rate_hz": 30}, "pose": down}
     eye |= {"field_of_view": {"vertical_deg": 50}, "streams": ["color"]}
-    with opened({"cameras": {"eye": eye}, "objects": ["floor", *things]}, ENGINES[0]) as rig:
-        assert rig.cameras["eye"].read().color is not None
+    objects = ["floor", {"name": "rod", "urdf": str(tmp_path / "rod.urdf"), "position": [0, 0, 1], "fixed": True}]
+    seen = []
+    for shadows in (True, False):
+        config = {"cameras": {"eye": eye}, "objects": objects, "simulation": {"shadows": shadows}}
+        with opened(config, ENGINES[0]) as rig:
+            seen.append(rig.cameras["eye"].read().color)
+    assert not np.array_equal(*seen)
 
 
 def test_a_renderer_that_cannot_vary_the_light_says_so() -> None:

@@ -19,6 +19,7 @@ from waiting import wait_until
 import hal
 from hal.config.data_files import find_data
 from hal.skills import grasp, grasp_pose, locate_by_truth
+from hal_emulators.lab import list_emulators
 
 from .franka_kit import free_host
 from .ur_kit import PORTS
@@ -134,3 +135,12 @@ def test_no_emulator_outlives_it(lab: Lab, config: Path, number: int) -> None:
     while any(Path(f"/proc/{child}").exists() for child in children) and time.monotonic() < limit:
         time.sleep(0.02)
     assert not any(Path(f"/proc/{child}").exists() for child in children)
+
+
+def test_it_names_a_model_that_has_no_emulator_and_knows_the_address_of_localhost(tmp_path: Path) -> None:
+    arm, _ = list_emulators("ur5e_robotiq", ["robots.arm.real.host=localhost"])
+    assert arm.arguments[1:5] == ["--robot", "ur5e", "--host", "127.0.0.1"]
+    model = tmp_path / "my_ur16e.yaml"
+    model.write_bytes(find_data("robots", "ur5e.yaml").read_bytes())
+    with pytest.raises(ValueError, match=r"arm: .*my_ur16e.* has no emulator, only ur10e, ur3e, ur5, ur5e"):
+        list_emulators("ur5e_robotiq", [f"robots.arm.model={model}"])

@@ -26,6 +26,7 @@ FAULTS = {
     "PROGRAM_STOPPED": ("program", ""),
     "PROGRAM_STOPPED by another program": ("program thief", "program"),
     "SPEED_SLIDER": ("slider 0.5", "slider 1"),
+    "SPEED_SCALED": ("limit 0.5", "limit 1"),
     "SILENT": ("silence 0.6", ""),
     "SILENT without a connection": ("cut 0.6", ""),
     "SILENT until late states come": ("late 0.4", "late 0"),
@@ -104,6 +105,21 @@ def test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover(
         emulator.control.send("power on")
     recover(rig, arm)
     assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
+
+
+def test_a_controller_that_ignores_set_points_is_stopped_before_they_run_away(
+    rig: hal.Rig, emulator: UrEmulator
+) -> None:
+    arm = rig.robots["arm"]
+    arm.move_to(arm.home, unattended=True)
+    emulator.control.send("stuck on")
+    with pytest.raises(hal.RobotFault):
+        arm.move_to(arm.home + 0.5, unattended=True)
+    assert find_code(arm) == "NOT_FOLLOWING"
+    emulator.wait_for(lambda status: not status["program"])
+    emulator.control.send("stuck off")
+    recover(rig, arm)
+    assert arm.move_to(arm.home, unattended=True).q == pytest.approx(arm.home, abs=2e-3)
 
 
 def stop_in_motion(rig: hal.Rig, emulator: UrEmulator, cause: str) -> None:

@@ -24,8 +24,10 @@ UPRIGHT_GAIN = 6.0
 _AROUND = 0.025
 """Distance of the tcp from an object below which the fingers are around it, m; on top of it they are farther away."""
 _LEAD = (0.01, 0.05)
-"""Greatest lead of the set-point, m and rad, over a simulated hand that something holds back: more of it would stop the
-arm, mostly while a policy explores around an object."""
+"""Greatest lead of the set-point, m and rad, over a hand that something holds back, beyond its :data:`_LAG`: more of it
+would stop the arm, mostly while a policy explores around an object."""
+_LAG = 0.1
+"""How far a hand that nothing holds back may be behind its set-point for each m/s or rad/s, s: real arms lag."""
 _FREE = 0.01
 """How much wider than an object the fingers must open, m."""
 _STILL = 0.2
@@ -108,18 +110,24 @@ class Hand:
         lean = np.cross(down, (0.0, 0.0, -1.0))[:2]  # what turns the set-point's z axis down again
         turn = [*(UPRIGHT_GAIN * lean).clip(-most[3], most[3]), velocity[3]]
         twist = np.concatenate([self._turn @ velocity[:3], self._turn @ turn])
-        if self._env.rig.lock_step:  # real arms lag, also where nothing is in their way
-            poses = (pose_array(pose).tolist() for pose in (state.tcp, state.tcp_set))
-            self._hold_back(twist, np.array(difference(*poses)))
+        poses = (pose_array(pose).tolist() for pose in (state.tcp, state.tcp_set))
+        self._hold_back(twist, np.array(difference(*poses)), state.tcp_twist)
         numbers: list[float] = twist.tolist()
         return numbers
 
-    def _hold_back(self, twist: Array, lead: Array) -> None:
-        """Slow a twist (6,) down, or turn it round, where the set-point is well ahead of the hand, by ``lead`` (6,)."""
+    def _hold_back(self, twist: Array, lead: Array, moves: Array) -> None:
+        """Slow a twist (6,) down, or turn it round, where the set-point is well ahead of the hand.
+
+        Args:
+            twist: The twist, along the axes of the arm's base.
+            lead: The twist that would bring the hand to the set-point within 1 s (6,).
+            moves: The measured twist of the hand (6,), which explains some of it.
+        """
         for part, most in zip((slice(3), slice(3, 6)), _LEAD, strict=True):
-            off = float(np.linalg.norm(lead[part]))
+            away = float(np.linalg.norm(lead[part]))
+            ahead = lead[part] / max(away, 1e-9)
+            off = away - _LAG * max(0.0, float(moves[part] @ ahead))
             if off > 0.5 * most:
-                ahead = lead[part] / off
                 fastest = (most - off) * self._env.settings.rate_hz
                 twist[part] -= max(0.0, float(twist[part] @ ahead) - fastest) * ahead
 

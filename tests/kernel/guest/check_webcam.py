@@ -14,7 +14,8 @@ import pytest
 from kit import Measured, eventually
 
 from hal.drivers.webcam import kernel
-from hal.drivers.webcam.capture import V4l2Camera, preflight
+from hal.drivers.webcam.capture import V4l2Camera
+from hal.drivers.webcam.preflight import check_v4l2
 from hal.errors import ControlTaken, DeviceNotFound, NotSupported
 from hal.specs import CameraSpec
 from hal.testing import CameraBench, CameraContract, camera_spec
@@ -135,7 +136,7 @@ def check_controls_are_set_and_their_automatics_switched_off(cameras: None) -> N
 
 
 def check_the_preflight_measures_it(cameras: None, measured: Measured) -> None:
-    camera, frames = preflight(_spec(), 3.0)
+    camera, frames = check_v4l2(_spec(), 3.0)
     assert camera.level == "ok"
     assert frames.level in ("ok", "warn")
     measured(frames.found)

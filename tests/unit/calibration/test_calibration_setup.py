@@ -15,7 +15,7 @@ from hal.calibration.setup import (
     back_up,
     find_setup,
     initial_guess,
-    replace_camera_place,
+    replace_camera_entry,
     write_file,
 )
 from hal.config import load
@@ -49,7 +49,7 @@ def test_a_block_is_replaced_and_what_follows_stays() -> None:
         "      distance: 1.0   "
     )
     assert old in BLOCK
-    assert replace_camera_place(BLOCK, "wrist", "pose", VALUE) == BLOCK.replace(old, f"    pose: {VALUE}   ")
+    assert replace_camera_entry(BLOCK, "wrist", "pose", VALUE) == BLOCK.replace(old, f"    pose: {VALUE}   ")
 
 
 WAYS = [
@@ -75,7 +75,7 @@ WAYS = [
 def test_all_styles_of_yaml(text: str, old: str, new: str, key: str) -> None:
     value = VALUE if key == "pose" else HAND
     assert text.count(old) == 1
-    assert replace_camera_place(text, "wrist", key, value) == text.replace(old, new.replace("@", f"{key}: {value}"))
+    assert replace_camera_entry(text, "wrist", key, value) == text.replace(old, new.replace("@", f"{key}: {value}"))
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_all_styles_of_yaml(text: str, old: str, new: str, key: str) -> None:
 )
 def test_a_file_that_cannot_be_edited_safely_is_refused_with_what_to_write(text: str, code: str) -> None:
     with pytest.raises(CommandError) as caught:
-        replace_camera_place(text, "wrist", "attached", HAND)
+        replace_camera_entry(text, "wrist", "attached", HAND)
     assert caught.value.code == code
     assert f"attached: {HAND}" in str(caught.value)
 
@@ -172,6 +172,17 @@ def test_a_rig_that_would_not_load_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
         RigFileOutput(path, path, "wrist").write("attached", f"{{robot: unknown, link: hand, pose: {VALUE}}}")
     assert (path.read_bytes(), os.listdir(tmp_path)) == (before, ["rig.yaml"])
+
+
+def test_a_place_that_cannot_be_edited_refuses_a_place_only(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("cameras:\n  a: {model: webcam, pose: &p [0, 0, 1, 1, 0, 0, 0]}\n  b: {pose: *p, model: webcam}\n")
+    output = RigFileOutput.of(str(path), None, "b")
+    assert "b: {pose: *p, model: webcam, intrinsics: {" in output.check(
+        "intrinsics", "{width: 640, height: 480, fx: 1, fy: 1, cx: 0, cy: 0}"
+    )
+    with raises_code(CommandError, "not_editable"):
+        output.check("pose", VALUE)
 
 
 def test_a_built_in_rig_and_a_missing_folder_are_not_written_to(tmp_path: Path) -> None:

@@ -314,11 +314,6 @@ def test_keys_that_are_given_twice(tmp_path: Path) -> None:
     assert "lines 2 and 3" in found[0].message
 
 
-def test_a_folder_in_place_of_a_file(tmp_path: Path) -> None:
-    (tmp_path / "rig.yaml").mkdir()
-    assert only(tmp_path / "rig.yaml").code == "unreadable"
-
-
 # Overrides and arguments.
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import resource
 import sys
@@ -13,10 +14,12 @@ from types import ModuleType
 import pytest
 
 from hal.config import load
+from hal.driver import CameraDriver, RawFrame
 from hal.errors import DriverMissing
-from hal.preflight import CheckResult, check_machine, has_realtime_kernel, list_real_arms, preflight
+from hal.preflight import CheckResult, check_frames, check_machine, has_realtime_kernel, list_real_arms, preflight
 from hal.registry import DriverSpec
 from hal.specs import CameraSpec, Plan, RobotSpec
+from hal.testing import camera_spec
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux")
 
@@ -100,6 +103,40 @@ def test_a_camera_is_checked_by_its_driver_unless_left_out(monkeypatch: pytest.M
     plan = replace(plan, cameras=(replace(first, driver="checked_camera:DRIVER"), *others))
     assert of_arms(plan) == [CheckResult(f"{first.name}: rate", "ok", "30 Hz over 0.25 s")]
     assert [v for v in preflight(plan, 0.25, cameras=False) if ":" in v.name] == []
+
+
+class CountingCamera(CameraDriver):
+    """Takes frames at a rate, of which every n-th arrives."""
+
+    def __init__(self, rate_hz: float, nth: int) -> None:
+        super().__init__(camera_spec())
+        self.rate_hz, self.numbers = rate_hz, itertools.count(7, nth)
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def grab(self, timeout: float) -> RawFrame | None:
+        number = next(self.numbers)
+        return RawFrame(number / self.rate_hz, 0.0, number) if self.rate_hz else None
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "nth", "level", "remedy"),
+    [
+        (30.0, 1, "ok", ""),
+        (29.0, 1, "ok", ""),
+        (15.0, 1, "warn", "slow"),
+        (30.0, 2, "warn", "lossy"),
+        (15.0, 2, "warn", "slow"),
+        (0.0, 1, "fail", "silent"),
+    ],
+)
+def test_slow_cameras_and_lost_frames_have_remedies_of_their_own(
+    rate_hz: float, nth: int, level: str, remedy: str
+) -> None:
+    found = check_frames(CountingCamera(rate_hz, nth), 0.01, "slow", "lossy", "silent")
+    assert (found.level, found.remedy) == (level, remedy), found.found
 
 
 # This computer

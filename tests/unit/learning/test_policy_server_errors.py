@@ -13,7 +13,7 @@ import aiohttp
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from remote_policy_kit import CONFIG, STEPS, assert_within_limits, run, sine, stay
+from remote_policy_kit import CONFIG, STEPS, assert_within_limits, run, stay
 
 import hal
 from hal.learning.asynchronous import RemotePolicy
@@ -159,29 +159,6 @@ def test_a_first_target_far_away_is_refused(rig: Rig) -> None:
     assert isinstance(outcome.error, hal.CommandError)
 
 
-def test_a_server_that_freezes_stops_the_arm_within_its_last_chunk(rig: Rig) -> None:
-    wave, calls, ended = sine(rig), [], threading.Event()
-
-    def infer(request: dict[str, Any]) -> dict[str, Any]:
-        calls.append(rig.clock.now())
-        if len(calls) == 3:
-            ended.wait(10.0)  # as if the server were frozen
-        t = rig.clock.now() + np.arange(STEPS) / 15
-        return {"actions": np.array([[*wave(x), 0.0] for x in t])}
-
-    with PolicyServer(infer) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url, timeout=0.3), load_policy_config(CONFIG))
-        try:
-            outcome = PolicyRunner(rig, policy, rate_hz=50, seconds=5.0, cameras=()).run()
-        finally:
-            ended.set()
-            policy.close()
-    assert isinstance(outcome.error, hal.PolicyError)
-    assert outcome.error.code == "policy_timeout"
-    assert rig.clock.now() < calls[-1] + STEPS / 15 + 1.0
-    assert np.abs(rig.robots["panda"].state().dq_set).max() < 1e-9
-
-
 def test_a_request_that_the_server_does_not_take_closes_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     async def block(*_: Any) -> None:
         await asyncio.sleep(60.0)  # as a full buffer does
@@ -284,23 +261,6 @@ def test_no_server_is_an_error_before_anything_moves(rig: Rig) -> None:
     with raises_code(hal.PolicyError, "policy_unreachable"):
         PolicyRunner(rig, policy, cameras=()).rehearse()
     policy.close()
-
-
-def test_a_new_connection_is_made_for_the_next_episode(rig: Rig) -> None:
-    calls: list[int] = []
-
-    def infer(request: dict[str, Any]) -> dict[str, Any]:
-        calls.append(1)
-        if len(calls) == 2:
-            raise ValueError("once")
-        return stay(request)
-
-    with PolicyServer(infer) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
-        runner = PolicyRunner(rig, policy, rate_hz=50, seconds=1.0, cameras=())
-        outcomes = [runner.run(), runner.run()]
-        assert [outcome.ended for outcome in outcomes] == ["error", "time"]
-        policy.close()
 
 
 def test_an_answer_from_before_a_pause_is_not_used(rig: Rig) -> None:

@@ -156,6 +156,35 @@ def test_fingers_that_never_rest_end_the_replay(monkeypatch: pytest.MonkeyPatch)
         assert np.abs(arm.state().dq_set).max() < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("faults", "text"),
+    [
+        ({"fail": "worn out"}, "failed, while the arm waits for its fingers: worn out"),
+        ({"disconnect": True}, "failed, while the arm waits for its fingers: .* does not answer"),
+        ({"freeze": True}, "does not come to rest, as it did in the recording: .* silent for"),
+    ],
+)
+def test_fingers_that_fail_or_are_silent_do_not_let_the_arm_leave(
+    monkeypatch: pytest.MonkeyPatch, faults: dict[str, Any], text: str
+) -> None:
+    monkeypatch.setattr(replay_module, "_LONGEST_WAIT", 1.0)
+    episode = record(rest=(1.0, 3.0))
+    with opened("mock") as rig:
+        arm = rig.robots["panda"]
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm))
+        (wait,) = player.trajectory.find_waits()
+        player.approach()
+
+        def on_turn(player: TrajectoryPlayer, plays: bool) -> None:
+            if 1.2 < player.progress < 1.5:
+                rig.driver("panda.gripper").inject(**faults)
+            assert player.progress < wait + 0.03
+
+        with pytest.raises(hal.RobotFault, match=text):
+            player.play(on_turn)
+        assert np.abs(arm.state().dq_set).max() < 1e-6
+
+
 def test_objects_are_put_back_to_their_recorded_poses() -> None:
     episode = record("simulation", seconds=1.0, cube=hal.Pose([0.15, 0.2, 0.63]))
     with opened("simulation") as rig:

@@ -259,6 +259,24 @@ def test_a_policy_that_explores_around_the_cube_does_not_stop_the_arm(engine: st
         env.close()
 
 
+def test_a_hand_that_only_lags_is_not_slowed_down() -> None:
+    late = "simulation.randomize={robots: {'*': {command_latency_s: [0.04, 0.04]}}}"
+    ways = []
+    for overrides in ((), (late,)):
+        env = gymnasium.make("hal/PickCube-v0", overrides=overrides).unwrapped
+        try:
+            env.reset(seed=0)
+            start = env.tcp.position
+            for _ in range(16):
+                env.step(np.array([0.0, 1.0, 0.0, 0.0, -1.0]))
+            state = env.robot.state()
+            ways.append(np.linalg.norm(state.tcp_set.position - start))
+        finally:
+            env.close()
+    assert np.linalg.norm(state.tcp_set.position - state.tcp.position) > 0.008, "it lags"
+    assert ways[1] == pytest.approx(ways[0], rel=0.05)
+
+
 def test_a_script_ends_where_it_does_not_arrive() -> None:
     env = gymnasium.make("hal/PushCube-v0", rate_hz=5.0).unwrapped
     try:

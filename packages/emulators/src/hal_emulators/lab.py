@@ -14,7 +14,9 @@ from typing import NamedTuple
 
 from hal.config.loader import load
 from hal.specs import RobotSpec
-from hal_emulators.shared_world import has_world
+from hal_emulators.control import note_signals
+from hal_emulators.shared_world import find_address, has_world
+from hal_emulators.ur.motion import ROBOTS
 
 _END = 10.0
 """Longest time that the emulators take to end, s."""
@@ -41,7 +43,7 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
 
     Raises:
         ConfigError: The rig is not valid.
-        ValueError: A device is not at an address of this computer, or nothing is real.
+        ValueError: A device is not at an address of this computer, a UR's model has no emulator, or nothing is real.
     """
     rig = load(config, sim=False, overrides=overrides).resolve()
     words = ["--config", config, *(word for value in overrides for word in ("--set", value))]
@@ -68,8 +70,11 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
         return Emulator("robotiq", ["robotiq", *words])
     if arm.driver != driver or driver not in ("franka", "ur"):
         return None
-    options = ["--host", str(arm.options["host"]), *(words if in_world else [])]
+    options = ["--host", find_address(arm), *(words if in_world else [])]
     if driver == "ur":
+        if arm.model not in ROBOTS:
+            known = ", ".join(sorted(ROBOTS))
+            raise ValueError(f"{arm.name}: its model {arm.model} has no emulator, only {known}")
         return Emulator(arm.name, ["ur", "--robot", arm.model, *options])
     bare = arm.gripper is None or arm.gripper.driver != driver
     hand = ["--end-effector", "none", "--no-hand"] if bare else []
@@ -84,9 +89,7 @@ def run_lab(config: str, overrides: Sequence[str] = ()) -> int:
     Raises:
         ConfigError, ValueError: As :func:`list_emulators`.
     """
-    ends: list[int] = []  # not an Event: a second signal within its set() would wait for ever
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, _: ends.append(number))
+    ends = note_signals()
     emulators = list_emulators(config, overrides)
     failed = False
     with contextlib.ExitStack() as stack:

@@ -55,6 +55,8 @@ class Controller:
         """Whether the program is paused."""
         self.force = [0.0] * 6
         """What pushes the arm, N and Nm in the controller's base."""
+        self.stuck = False
+        """Whether it ignores set-points of ``servoj``."""
         self.offset = 0
         self.events: list[str] = []
         """What happened, the newest last."""
@@ -126,6 +128,10 @@ class Controller:
         self.paused, self._t_written = paused and bool(self.program), self.now
         if paused:
             self.motion.stop(_PROGRAM_STOP)
+
+    def push(self, force: Sequence[float]) -> None:
+        """Push the arm with a force (3,), N in the controller's base."""
+        self.force = [*force, 0.0, 0.0, 0.0]
 
     def jog(self, joint: int, angle: float) -> None:
         """Move a joint by hand, rad. Raises ValueError while a program runs."""
@@ -243,7 +249,7 @@ class Controller:
             motion.move(x(0, 6), *x(6, 2))
             if not self.inputs.get(f"input_int_register_{self.offset + 1}", 0):
                 self._busy = lambda: motion.at_rest
-        elif command == 11:  # servoj
+        elif command == 11 and not self.stuck:  # servoj
             motion.servo(x(0, 6), *x(9))
         elif command == 9:  # speedj
             motion.speed(x(0, 6), *x(6))
@@ -281,7 +287,7 @@ class Controller:
             "robot_status_bits": (self.robot_mode == RUNNING) | (2 if self.program else 0),
             "safety_status_bits": _SAFETY_BITS[self.safety_mode],
             "runtime_state": PAUSED if self.paused else PLAYING if self.program else STOPPED,
-            "speed_scaling": motion.scale,
+            "speed_scaling": motion.scale * motion.limit,
             "target_speed_fraction": motion.scale,
             "payload": self.payload,
             "payload_cog": self.cog,

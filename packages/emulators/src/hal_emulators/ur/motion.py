@@ -84,6 +84,8 @@ class TargetMotion:
         self.dt = dt
         self.scale = 1.0
         """Share of the speed that the slider allows."""
+        self.limit = 1.0
+        """Share of that to which the controller scales the speed, as near a safety limit."""
         self.place(q)
 
     def place(self, q: Sequence[float]) -> None:
@@ -139,7 +141,7 @@ class TargetMotion:
         return None
 
     def _next(self) -> Floats:
-        dt = self.dt * self.scale
+        dt = self.dt * self.scale * self.limit
         if self._kind == "servo":
             share = 1.0 - math.exp(-2.0 * dt / self._lookahead)
             self._between = [a + share * (b - a) for a, b in zip(self._between, self._goal, strict=True)]
