@@ -349,14 +349,6 @@ def test_output_is_the_captures_centre_scaled() -> None:
         assert (y + 0.5) / 256 == pytest.approx((v + 0.5) / 480)
 
 
-def test_a_4_to_3_mode_of_the_d435_is_the_middle_of_its_sensor() -> None:
-    wide = camera(model="realsense_d435", capture={"width": 1280, "height": 720, "rate_hz": 30})
-    narrow = camera(model="realsense_d435", capture={"width": 640, "height": 480, "rate_hz": 30})
-    assert wide.K[0][0] == pytest.approx(640 / math.tan(math.radians(69.4 / 2)))
-    assert narrow.K[0][0] == pytest.approx(wide.K[0][0] * 480 / 720)
-    assert (wide.depth_min, narrow.depth_min) == (0.28, 0.175)
-
-
 @pytest.mark.parametrize(
     ("size", "out", "crop"),
     [

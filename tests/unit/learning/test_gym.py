@@ -110,25 +110,6 @@ if os.environ.get("HAL_SB3") == "1":  # not by default: PyTorch may bring gigaby
             env.close()
 
 
-def run(steps: int) -> bytes:
-    env = RigEnv("panda_table", EnvSettings(action="joint"), sim=True, overrides=BARE)
-    try:
-        seen, _ = env.reset(seed=7)
-        env.action_space.seed(7)
-        trace = [seen["q"]]
-        for _ in range(steps):
-            seen, *_ = env.step(env.action_space.sample())
-            trace += [seen["q"], seen["dq"], seen["tcp"], seen["gripper"], env.rig.world.pose("cube").position]
-        assert np.ptp([q[0] for q in trace[1::5]]) > 0.02, "it moved"
-        return np.concatenate(trace).tobytes()
-    finally:
-        env.close()
-
-
-def test_the_same_seed_and_actions_give_the_same_states_to_the_bit() -> None:
-    assert run(50) == run(50)
-
-
 def test_an_action_moves_the_arm_by_its_values() -> None:
     env = RigEnv("panda_table", EnvSettings(action="tcp_delta"), sim=True, overrides=BARE)
     try:
@@ -314,25 +295,21 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
         env.close()
 
 
-def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
-    for wrong in ({"action": "jump"}, {"robots": "pandda"}, {"cameras": ["wirst"]}):
-        with pytest.raises(hal.HalError):
-            RigEnv("panda_table", EnvSettings(**wrong), driver="mock")
-
-
 @pytest.mark.parametrize(
     ("wrong", "code"),
     [
         ({"rate_hz": 0.0}, "bad_command"),
         ({"rate_hz": 0.5}, "rate_too_low"),
         ({"action": "jump"}, "unknown_action"),
+        ({"robots": "pandda"}, "no_robot"),
+        ({"cameras": ["wirst"]}, "no_camera"),
         ({"controller": "impedance"}, "bad_controller"),
         ({"controller": hal.JointImpedance(stiffness=[1.0])}, "bad_controller"),
         ({"controller": hal.JointImpedance(), "action": "torque"}, "torques_by_controller"),
     ],
 )
 def test_arguments_of_later_calls_are_checked_at_once(wrong: dict[str, object], code: str) -> None:
-    with raises_code(hal.CommandError, code):
+    with raises_code(hal.HalError, code):
         RigEnv("panda_table", EnvSettings(**wrong), driver="mock", overrides=BARE)  # type: ignore[arg-type]
     with raises_code(hal.CommandError, "not_callable"):
         RigEnv("panda_table", driver="mock", deadman="pad")  # type: ignore[arg-type]

@@ -18,12 +18,6 @@ Rig = hal.Rig
 UP = hal.Twist([0.0, 0.0, 0.05])
 
 
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        yield rig
-
-
 def height(rig: Rig) -> float:
     return float(rig.robots["panda"].state().tcp.position[2])
 

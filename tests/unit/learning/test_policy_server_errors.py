@@ -6,7 +6,6 @@ import asyncio
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import aiohttp
@@ -24,12 +23,6 @@ from hal.learning.remote import PolicyClient, PolicyServer, pack
 pytest.importorskip("msgpack")
 
 Rig = hal.Rig
-
-
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        yield rig
 
 
 # What a server can do wrong.
@@ -304,18 +297,12 @@ ARENA: dict[str, Any] = {
 
 def test_a_roboarena_server_is_reset_and_told_its_session(rig: Rig) -> None:
     seen: list[dict[str, Any]] = []
-    with PolicyServer(stay, reset=seen.append, metadata=ARENA) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
-        assert PolicyRunner(rig, policy, rate_hz=50, seconds=0.5, cameras=()).run(seed=7).ended == "time"
-        policy.close()
+    assert run(rig, stay, reset=seen.append, metadata=ARENA, seconds=0.5).ended == "time"
     assert [sorted(request) for request in seen] == [["session_id"]]
 
 
 def test_a_reset_that_fails_on_the_server_is_named_as_the_cause(rig: Rig) -> None:
-    with PolicyServer(stay, reset=fails, metadata=ARENA) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
-        outcome = PolicyRunner(rig, policy, rate_hz=50, seconds=0.5, cameras=()).run()
-        policy.close()
+    outcome = run(rig, stay, reset=fails, metadata=ARENA, seconds=0.5)
     assert isinstance(outcome.error, hal.PolicyError)
     assert (outcome.error.code, outcome.turns) == ("policy_error", 0)
 
