@@ -25,7 +25,7 @@ from .controller import POWER_OFF, RUNNING, Controller
 
 __all__ = ["COMMANDS", "UrServer"]
 
-RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
+RTDE, DASHBOARD, PRIMARY, SCRIPTS = 30004, 29999, 30001, (30001, 30002, 30003)
 _PRIORITY = 40
 """Of this process among SCHED_FIFO ones; a host has 50."""
 _LONGEST = 1 << 20
@@ -209,6 +209,8 @@ class UrServer:
             self._selector.register(line, selectors.EVENT_READ, client)
             if port == DASHBOARD:
                 self._send(client, b"Connected: Universal Robots Dashboard Server\n")
+            elif port == PRIMARY:
+                self._send(client, self.controller.pack_kinematics())
 
     def _drop(self, client: _Client) -> None:
         if client in self._clients:
@@ -367,6 +369,7 @@ class UrServer:
         old = self.controller
         self._lose = self._delay = self._silent_until = self._cut_until = 0.0
         self.controller = Controller(old.robot, self._home, 0.0, [0.0] * 6)
+        self.controller.dh = old.dh
         self.controller.now = old.now
 
     def _describe(self) -> dict[str, Any]:
