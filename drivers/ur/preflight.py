@@ -110,8 +110,8 @@ def _check_calibration(spec: RobotSpec, host: str) -> CheckResult:
     if max(apart) > _OTHER_ARM:
         return CheckResult("calibration", "fail", found, f"this is no {spec.model}: name its model in the rig")
     if max(apart) < _NOMINAL:
-        return CheckResult("calibration", "ok", "none: the controller has the nominal lengths, as the model")
-    return CheckResult("calibration", "ok", f"calibrated by UR, which the driver does not use: {found}")
+        return CheckResult("calibration", "ok", "none: the controller has the nominal lengths, as the model has")
+    return CheckResult("calibration", "ok", f"a factory calibration, not used here: {found}")
 
 
 def _read_kinematics(host: str) -> NDArray[np.float64]:

@@ -181,7 +181,7 @@ def test_the_check_names_the_calibration_and_another_arm() -> None:
         before = forward(twin.dh, spec.home, tcp)[:3]
         twin.calibrate(0)
         off = 1e3 * np.linalg.norm(np.subtract(before, forward(twin.dh, spec.home, tcp)[:3]))
-        assert "calibrated by UR, which the driver does not use: the model" in found["calibration"].found
+        assert "a factory calibration, not used here: the model" in found["calibration"].found
         assert found["calibration"].found.endswith(f"by {off:.1f} mm at home")
         rig = emulator.rig()
         rig["robots"]["arm"]["model"] = "ur16e"
