@@ -1,71 +1,21 @@
-"""The console: processor time, latency from a key to a set-point, and times until the arm brakes. Needs Chromium."""
+"""The console: latency from a key to a set-point, and times until the arm brakes. Needs Chromium."""
 
 from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import hal
-
-from .kit import ROOT, Table, cpu, ms, ticks_missed
+from .kit import ROOT, Table, ms
 
 sys.path.append(str(ROOT / "tests"))
 from browser.kit import Bench, Browser, wait_for
 
 PATHS = ("drivers/web", "hal/views.py")
-
-
-def first_link() -> float:
-    """Return the time from the command to its link, s."""
-    command = [sys.executable, "-m", "hal.apps.main", "teleop", "--sim", "--pad", "web", "--listen", ":0"]
-    begun = time.monotonic()
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as app:
-        assert app.stdout is not None
-        next(line for line in app.stdout if "http://" in line)
-        spent = time.monotonic() - begun
-        app.terminate()
-        app.stdout.read()
-    return spent
-
-
-def cost(seconds: float) -> Table:
-    """Return the console's processor time and the servo's missed ticks, without a page and with one that drives."""
-    table = Table(
-        "two 256x256 cameras at 30 Hz, a servo at 240 Hz", ("", "processor, %", "ticks missed, %", "frames/s")
-    )
-    with hal.open("panda_table", sim=True, pad="none") as rig:
-        table.add("without the console (reference)", None, _measure(rig, None, seconds)[1])
-    bench = Bench(cameras=True)
-    try:
-        pid = bench.console._child.process.pid  # type: ignore[attr-defined]
-        table.add("no page", *_measure(bench.rig, pid, seconds))
-        browser = Browser()
-        try:
-            browser.open(bench.link)
-            browser.wait_driving()
-            browser.hold()
-            cells = _measure(bench.rig, pid, seconds)
-            cameras = browser.facts["lastState"]["cameras"].values()
-            shown = ", ".join(f"{camera['fps']:.1f} ({1e3 * camera['age']:.0f} ms old)" for camera in cameras)
-            table.add("Chromium drives", *cells, shown)
-        finally:
-            browser.close()
-    finally:
-        bench.close()
-    return table
-
-
-def _measure(rig: hal.Rig, pid: int | None, seconds: float) -> tuple[float | None, float]:
-    before = cpu(pid) if pid else 0.0
-    with ticks_missed(rig) as host:
-        time.sleep(seconds)
-    return 100.0 * (cpu(pid) - before) / seconds if pid else None, host["missed"]
 
 
 def latencies(presses: int) -> list[float]:
@@ -151,9 +101,7 @@ def braking(way: Callable[[Browser], float]) -> float:
 def run(quick: bool) -> Iterator[Table]:
     """Yield the tables."""
     presses, runs = (1, 1) if quick else (60, 6)
-    yield cost(0.5 if quick else 20.0)
     table = Table(f"times, ms, of {presses} presses and {runs} of each event", ("", "p50, p99", "median (max)"))
-    table.add("from the command to its link", None, ms([first_link() for _ in range(runs)]))
     table.add("from a key in the page to a set-point that moves", ms(latencies(presses), 0.5, 0.99))
     for name, way in list(STOPS.items())[: 1 if quick else None]:
         table.add(f"{name}: braking begins after", None, ms([braking(way) for _ in range(runs)]))

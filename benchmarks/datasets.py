@@ -1,7 +1,5 @@
 """Datasets of many episodes: how fast they open, are read at random, continued and curated, and what the index takes.
 
-    python benchmarks/datasets.py [--episodes 10000] [--frames 5000]
-
 A few short episodes of a mock rig with two small cameras are recorded, and merged with themselves, ten at a time. At
 most 1,024 files may be open. Every figure stands beside those of datasets with a tenth and a hundredth of the episodes,
 and random pictures beside PyAV by hand.
@@ -9,14 +7,11 @@ and random pictures beside PyAV by hand.
 
 from __future__ import annotations
 
-import argparse
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +20,9 @@ import numpy as np
 import hal
 from hal.recording import Dataset, Episode, Recorder, delete_episodes, mark_episodes, merge, pack
 
+from .kit import ROOT, Table, compare, timed
+
+PATHS = ("hal/recording",)
 FPS, SECONDS, RECORDED = 20, 1.0, 10
 CAMERAS = ("scene", "wrist")
 OPEN_FILES = 1024
@@ -43,13 +41,6 @@ def record(rig: hal.Rig, out: Path, episodes: int) -> float:
                     control.send(hal.Twist([0.0, 0.0, 0.05 * (-1) ** seed]))
             spent = timed(lambda: recorder.save(success=True, wait=True))
     return spent
-
-
-def timed(action: Callable[[], object]) -> float:
-    """Return how long an action takes, s."""
-    start = time.perf_counter()
-    action()
-    return time.perf_counter() - start
 
 
 def random_rows(out: Path, count: int) -> Iterator[tuple[Episode, str, int]]:
@@ -101,7 +92,8 @@ def read_all(out: Path) -> tuple[Episode, ...]:
 
 def memory(out: Path) -> list[float]:
     """Return the memory, kB an episode, of the metadata of all episodes, and after a row of each was read."""
-    done = subprocess.run([sys.executable, __file__, "--memory", out], capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", "import sys; from benchmarks.datasets import *; print_memory(Path(sys.argv[1]))"]
+    done = subprocess.run([*command, out], capture_output=True, text=True, check=True, cwd=ROOT)
     return [float(number) for number in done.stdout.split()]
 
 
@@ -131,77 +123,50 @@ def resident() -> float:
     return pages * resource.getpagesize() / 1e3
 
 
-def report(rig: hal.Rig, part: Path, out: Path, frames: int) -> None:
-    """Print one column of the table, of a dataset made of ten times a part."""
+def measure(rig: hal.Rig, part: Path, out: Path, frames: int) -> dict[str, float]:
+    """Return the figures of a dataset made of ten times a part; of times s, of sizes kB an episode."""
     rows = {"merge ten": timed(lambda: merge([part] * 10, out))}
     episodes = len(Dataset(out))
     rows["open"] = timed(lambda: Dataset(out))
     rows["open, and read the metadata of all episodes"] = timed(lambda: read_all(out))
     read_frames(out, 1)  # loads the libraries
     rows[f"{frames} random pictures"] = timed(lambda: read_frames(out, frames))
-    rows["  with PyAV by hand, files kept open"] = timed(lambda: read_frames_by_hand(out, frames, True))
-    rows["  with PyAV by hand, files opened each time"] = timed(lambda: read_frames_by_hand(out, frames, False))
+    rows["with PyAV by hand, files kept open"] = timed(lambda: read_frames_by_hand(out, frames, True))
+    rows["with PyAV by hand, files opened each time"] = timed(lambda: read_frames_by_hand(out, frames, False))
     rows[f"numbers of {frames} random rows"] = timed(lambda: read_numbers(out, frames))
-    print(f"{episodes} episodes of {SECONDS:g} s with two cameras, at most {OPEN_FILES} open files")
-    for name, size in zip(("of all metadata", "after reading a row of each"), memory(out), strict=True):
-        print(f"  {f'memory {name}, an episode':48s} {size:8.2f} kB")
+    rows["memory of all metadata, kB"], rows["memory after reading a row of each, kB"] = memory(out)
     for kind in ("meta", "episodes", "data", "videos"):
-        files = [path for path in (out / kind).rglob("*") if path.is_file()]
-        size = sum(path.stat().st_size for path in files) / episodes / 1e3
-        print(f"  {f'{kind}/, an episode':48s} {size:8.2f} kB in {len(files)} files")
+        rows[f"{kind}/, kB"] = folder_size(out / kind) / episodes
     rows["append: save one more"] = record(rig, out, 2)
     rows["pack after that"] = timed(lambda: pack(out))
     rows["mark one"] = timed(lambda: mark_episodes(out, {episodes // 2: False}))
     rows["mark a hundred"] = timed(lambda: mark_episodes(out, dict.fromkeys(range(0, episodes, episodes // 100), None)))
     rows["delete the last one"] = timed(lambda: delete_episodes(out, [episodes + 1]))
     rows["delete the first one"] = timed(lambda: delete_episodes(out, [0]))
-    for name, seconds in rows.items():
-        print(f"  {name:48s} {seconds:8.3f} s", flush=True)
+    return rows
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description="datasets of many episodes")
-    parser.add_argument("--episodes", type=int, default=10_000, help="of the largest dataset (%(default)s)")
-    parser.add_argument("--frames", type=int, default=5000, help="pictures that are read (%(default)s)")
-    parser.add_argument("--memory", type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.memory is not None:
-        print_memory(args.memory)
-        return
+def folder_size(folder: Path) -> float:
+    """Return the size of the files in a folder, kB."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e3
+
+
+def run(quick: bool) -> Iterator[Table]:
+    """Yield the table."""
+    most, frames = (100, 20) if quick else (10_000, 5000)
     resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
     overrides = [f"cameras.{name}.output.{side}={64}" for name in CAMERAS for side in ("width", "height")]
-    folder = Path(tempfile.mkdtemp())
-    try:
-        with hal.open("panda_table", driver="mock", overrides=overrides) as rig:
-            record(rig, folder / "part", RECORDED)
-            files = [path for kind in ("meta", "episodes") for path in (folder / "part" / kind).rglob("*.*")]
-            size = sum(path.stat().st_size for path in files if path.is_file()) / RECORDED / 1e3
-            print(f"{RECORDED} episodes as they are recorded: {size:.1f} kB an episode in meta/ and episodes/")
-            part, episodes = folder / "part", RECORDED
-            while (episodes := episodes * 10) <= args.episodes:
-                report(rig, part, folder / str(episodes), args.frames)
-                part = folder / str(episodes)
-    finally:
-        shutil.rmtree(folder)
-
-
-PATHS = ("hal/recording",)
-
-
-def run(quick: bool) -> list[object]:
-    """Return the table: a row for each line that :func:`main` prints."""
-    from contextlib import redirect_stdout
-    from io import StringIO
-    from unittest import mock
-
-    from .kit import Table  # this file is also run by its path
-
-    printed, words = StringIO(), ["--episodes", "100", "--frames", "20"] if quick else []
-    with redirect_stdout(printed), mock.patch("sys.argv", ["datasets", *words]):
-        main()
-    return [Table("datasets of many episodes", ("",), [(line,) for line in printed.getvalue().splitlines()])]
-
-
-if __name__ == "__main__":
-    main()
+    found: dict[str, dict[str, float]] = {}
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        hal.open("panda_table", driver="mock", overrides=overrides) as rig,
+    ):
+        part, episodes = Path(folder) / "part", RECORDED
+        record(rig, part, RECORDED)
+        recorded = {f"{kind}/, kB": folder_size(part / kind) / RECORDED for kind in ("meta", "episodes")}
+        found[f"{RECORDED} episodes as they are recorded"] = recorded
+        while (episodes := episodes * 10) <= most:
+            out = Path(folder) / str(episodes)
+            found[f"{episodes} episodes"] = measure(rig, part, out, frames)
+            part = out
+    yield compare(f"episodes of {SECONDS:g} s with two cameras, at most {OPEN_FILES} open files; times in s", found)

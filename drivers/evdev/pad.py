@@ -12,11 +12,11 @@ from types import MappingProxyType
 
 from pydantic import BaseModel, ConfigDict
 
-from hal.config.files import Problems
+from hal.config.files import Problems, check_record
 from hal.config.models import load_pad_models
 from hal.driver import GamepadDriver, PadReading, Plugged
 from hal.errors import NotSupported
-from hal.pads.model import PadModel, check_record, choose_model, guess_model, guess_warning, pad_model
+from hal.pads.model import PadModel, choose_model, guess_model, guess_warning, pad_model
 from hal.specs import PadSpec
 from hal.types import AXES
 
@@ -53,7 +53,8 @@ class EvdevPad(GamepadDriver):
         self._options = check_record(EvdevOptions, spec.options, place)
         chosen = (spec.model,) if spec.model is not None else spec.models
         self._models = tuple(pad_model(data, f"{place}, model {data.get('name')}") for data in chosen)
-        self._finder: DeviceFinder | None = DeviceFinder(system) if system is not None else None
+        self._on_this_machine = system is None
+        self._finder = DeviceFinder(LinuxInput() if system is None else system)
         self._is_open = False
         self._link: PadLink | None = None
         self._rumble: tuple[float, float, float] | None = None
@@ -82,21 +83,18 @@ class EvdevPad(GamepadDriver):
             NotSupported: This is not Linux.
             DriverMissing: python-evdev is not installed.
         """
-        if self._finder is None:
+        if self._on_this_machine:
             if sys.platform != "linux":
                 raise NotSupported("the evdev driver reads gamepads on Linux only", code="linux_only")
             evdev_module()
-            self._finder = DeviceFinder(LinuxInput())
         self._is_open = True
-        self._scan(self._finder)
+        self._scan()
 
     def poll(self, now: float, timeout: float) -> PadReading:
-        """See :meth:`GamepadDriver.poll`."""
-        finder = self._finder
-        if finder is None or not self._is_open:
+        if not self._is_open:
             return self._last
-        if (self._link is None or self._link.lacks_motion or self._link.lacks_touch) and finder.due():
-            self._scan(finder)
+        if (self._link is None or self._link.lacks_motion or self._link.lacks_touch) and self._finder.due():
+            self._scan()
         if self._link is None:
             if timeout > 0.0:
                 time.sleep(timeout)
@@ -126,8 +124,7 @@ class EvdevPad(GamepadDriver):
         if self._link is not None:
             self._seq += self._link.events + 1
             self._drop_link()
-        if self._finder is not None:
-            self._finder.forget()
+        self._finder.forget()
         self._last = self._last._replace(
             t=t, seq=self._seq, axes=_RELEASED, buttons=frozenset(), connected=False, unknown=()
         )
@@ -143,26 +140,26 @@ class EvdevPad(GamepadDriver):
 
     # Finding the pad and its parts.
 
-    def _scan(self, finder: DeviceFinder) -> None:
+    def _scan(self) -> None:
         """Open the pad, its motion sensor and its touchpad, if the devices changed since the last scan."""
-        nodes = finder.scan()
+        nodes = self._finder.scan()
         if nodes is None:
             return
         if self._link is None:
-            self._find_pad(finder, nodes)
+            self._find_pad(nodes)
         link = self._link
         if link is not None and link.lacks_motion:
-            self._find_part(finder, link, link.model.motion_node, nodes)
+            self._find_part(link, link.model.motion_node, nodes)
         if link is not None and link.lacks_touch:
-            self._find_part(finder, link, link.model.touch_node, nodes)
+            self._find_part(link, link.model.touch_node, nodes)
 
-    def _find_pad(self, finder: DeviceFinder, nodes: list[NodeInfo]) -> None:
+    def _find_pad(self, nodes: list[NodeInfo]) -> None:
         pads = [info for info in nodes if info.is_pad or info.is_joystick]
         wanted = [info for info in pads if self._is_wanted(info)]
         others = ", ".join(info.describe() for info in pads if info.is_pad)
         self.notes = (f"not the pad that the rig names: {others}",) if others and not wanted else ()
         for info in wanted:
-            self._connect(finder, info)
+            self._connect(info)
             if self._link is not None:
                 return
 
@@ -175,8 +172,8 @@ class EvdevPad(GamepadDriver):
             return True
         return choose_model(self._models, info.identity) is not None
 
-    def _connect(self, finder: DeviceFinder, info: NodeInfo) -> None:
-        node = self._try_open(finder, info)
+    def _connect(self, info: NodeInfo) -> None:
+        node = self._try_open(info)
         if node is None:
             return
         if not node.claim():
@@ -201,11 +198,11 @@ class EvdevPad(GamepadDriver):
             return
         self.flat, self.absolute = self._link.mapper.flat, self._link.mapper.model.absolute
 
-    def _find_part(self, finder: DeviceFinder, link: PadLink, ending: str | None, nodes: list[NodeInfo]) -> None:
+    def _find_part(self, link: PadLink, ending: str | None, nodes: list[NodeInfo]) -> None:
         """Open another device of the same pad: the one whose name has that ``ending``."""
         for info in nodes:
             if info.identity.name.endswith(ending or "") and info.belongs_to(link.info) and not info.is_pad:
-                part = self._try_open(finder, info, quiet=ending == link.model.touch_node)
+                part = self._try_open(info, quiet=ending == link.model.touch_node)
                 if part is None:
                     continue
                 try:
@@ -217,19 +214,19 @@ class EvdevPad(GamepadDriver):
                     part.close()
                 return
 
-    def _try_open(self, finder: DeviceFinder, info: NodeInfo, *, quiet: bool = False) -> EvdevNode | None:
+    def _try_open(self, info: NodeInfo, *, quiet: bool = False) -> EvdevNode | None:
         """Open a device; None where it is gone, or may not be read (udev sets the permissions a moment later).
 
         ``quiet`` adds no note where it may not be read: a desktop keeps touchpads to itself.
         """
         try:
-            return finder.open(info)
+            return self._finder.open(info)
         except PermissionError:
             note = permission_note(info)
             if note not in self.notes and not quiet:
                 self.notes = (*self.notes, note)
         except OSError:
-            finder.forget()
+            self._finder.forget()
         return None
 
     # Rumble, description and end.
@@ -249,7 +246,6 @@ class EvdevPad(GamepadDriver):
 
     @property
     def control_names(self) -> Mapping[str, str]:
-        """See :meth:`GamepadDriver.control_names`."""
         return self._link.model.control_names if self._link is not None else {}
 
     def describe(self) -> str:

@@ -6,7 +6,6 @@ import fcntl
 import os
 import struct
 import threading
-import time
 
 from hal.gamepad import RUMBLE_SECONDS
 from hal.pads.codes import EV_FF, FF_RUMBLE
@@ -85,13 +84,6 @@ class Rumble:
 
         threading.Thread(target=work, name="hal pad rumble", daemon=True).start()
         return True
-
-    def wait(self, timeout: float) -> bool:
-        """Wait at most ``timeout`` s for an upload to end; True if an effect is ready. For tests."""
-        end = time.monotonic() + timeout
-        while self._busy.locked() and time.monotonic() < end:
-            time.sleep(0.005)
-        return self._ready is not None
 
     def close(self) -> None:
         """Play nothing more. The kernel stops the motors when the device is closed. Idempotent."""

@@ -15,7 +15,7 @@ from hal.errors import CommandError, ConnectionLost
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
-from .faults import MockCameraFaults, change_faults
+from .faults import MockCameraFaults, MockDevice
 
 PLANE = 1.0
 """Distance of the background from the camera, m (or the camera's farthest depth, where that is nearer)."""
@@ -46,7 +46,7 @@ def read_picture(color: NDArray[np.uint8]) -> PictureStamp:
     return PictureStamp(int.from_bytes(head[:4], "little"), int.from_bytes(head[4:], "little", signed=True) / 1e6)
 
 
-class MockCamera(CameraDriver):
+class MockCamera(MockDevice[MockCameraFaults], CameraDriver):
     """A camera in memory that sees a plane, with a bright square in front of it that moves to the right.
 
     ``source`` is the rig's clock. In real time, frames come at the camera's rate, counted from ``open``. In lock-step
@@ -55,6 +55,7 @@ class MockCamera(CameraDriver):
     the square is body 0. Faults: :class:`~hal.drivers.mock.faults.MockCameraFaults`.
     """
 
+    kind: ClassVar[str] = "camera"
     simulated: ClassVar[bool] = True
 
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
@@ -62,7 +63,6 @@ class MockCamera(CameraDriver):
         if spec.width * spec.height * 3 < _HEAD:
             raise CommandError(f"camera {spec.name!r}: a mock picture needs 4 pixels, not {spec.width}x{spec.height}")
         self.faults = MockCameraFaults()
-        self.is_open = False
         self._clock = source if isinstance(source, Clock) else None
         self._waits = isinstance(source, RealClock)
         self._t_open = 0.0
@@ -154,25 +154,5 @@ class MockCamera(CameraDriver):
             "segmentation": segmentation,
         }
 
-    def inject(self, **faults: object) -> None:
-        """Set faults; those that are not named stay as they are.
-
-        Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.MockCameraFaults` with their new values.
-
-        Raises:
-            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
-                (``bad_fault_value``); nothing changes.
-        """
-        self.faults = change_faults(self.faults, faults)
-
-    def clear(self) -> None:
-        """Remove every fault."""
-        self.faults = MockCameraFaults()
-
     def close(self) -> None:
         self.is_open = False
-
-    def _expect_connected(self) -> None:
-        if self.faults.disconnect:
-            raise ConnectionLost(f"camera {self.spec.name!r} does not answer (the mock's fault 'disconnect')")

@@ -1,13 +1,16 @@
-"""The faults that mock devices can have: one frozen record per kind of device; by default there are none."""
+"""The faults that mock devices can have: one frozen record per kind of device; by default there are none.
+
+:class:`MockDevice` is what the devices share: setting faults, and being unplugged or closed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
-from typing import TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
-from hal.errors import CommandError
+from hal.errors import CommandError, ConnectionLost
 
 
 @dataclass(frozen=True)
@@ -91,23 +94,48 @@ _GARBAGE = {
 _F = TypeVar("_F", MockRobotFaults, MockGripperFaults, MockCameraFaults, MockPadFaults)
 
 
-def change_faults(present: _F, changes: Mapping[str, object]) -> _F:
-    """Return ``present`` with ``changes`` made.
+class MockDevice(Generic[_F]):
+    """A device in memory with faults."""
 
-    Raises:
-        CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
-            (``bad_fault_value``).
-    """
-    known = [f.name for f in fields(present)]
-    for name, value in changes.items():
-        if name not in known:
-            close = get_close_matches(name, known, n=1)
-            hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise CommandError(f"unknown fault {name!r}{hint}; faults: {', '.join(known)}", code="unknown_fault")
-        expected = _describe_expected(name, value, _GARBAGE.get(type(present), ()))
-        if expected is not None:
-            raise CommandError(f"{name} must be {expected}, not {value!r}", code="bad_fault_value")
-    return replace(present, **changes)  # type: ignore[arg-type]
+    kind: ClassVar[str]
+    """What it is called in messages."""
+    spec: Any
+    faults: _F
+    is_open = False
+
+    def inject(self, **faults: object) -> None:
+        """Set faults; those that are not named stay as they are.
+
+        Args:
+            faults: Fields of :attr:`faults` with their new values.
+
+        Raises:
+            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
+                (``bad_fault_value``); nothing changes.
+        """
+        known = [f.name for f in fields(self.faults)]
+        for name, value in faults.items():
+            if name not in known:
+                close = get_close_matches(name, known, n=1)
+                hint = f" (did you mean {close[0]!r}?)" if close else ""
+                raise CommandError(f"unknown fault {name!r}{hint}; faults: {', '.join(known)}", code="unknown_fault")
+            expected = _describe_expected(name, value, _GARBAGE.get(type(self.faults), ()))
+            if expected is not None:
+                raise CommandError(f"{name} must be {expected}, not {value!r}", code="bad_fault_value")
+        self.faults = replace(self.faults, **faults)  # type: ignore[arg-type]
+
+    def clear(self) -> None:
+        """Remove every fault, and the object of a gripper."""
+        self.faults = type(self.faults)()
+
+    def _expect_connected(self) -> None:
+        if self.faults.disconnect:
+            raise ConnectionLost(f"{self.kind} {self.spec.name!r} does not answer (the mock's fault 'disconnect')")
+
+    def _expect_open(self) -> None:
+        self._expect_connected()
+        if not self.is_open:
+            raise ConnectionLost(f"{self.kind} {self.spec.name!r} is not open")
 
 
 def _describe_expected(name: str, value: object, garbage: Sequence[str]) -> str | None:

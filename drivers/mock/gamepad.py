@@ -12,13 +12,13 @@ from hal.errors import CommandError
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS, ONE_SIDED
 
-from .faults import MockPadFaults, change_faults
+from .faults import MockDevice, MockPadFaults
 
 _TRIGGERS = tuple(name for name in BUTTONS if name in AXES)
 _TRIGGER_PRESSED = 0.1  # travel from which on a trigger, which is also a button, counts as pressed
 
 
-class MockPad(GamepadDriver):
+class MockPad(MockDevice[MockPadFaults], GamepadDriver):
     """A pad whose sticks and buttons a test moves: ``press``, ``release``, ``stick``, ``set``.
 
     A change becomes an event at the next ``poll``, with that poll's time. Triggers are axis and button in one, as on a
@@ -26,13 +26,13 @@ class MockPad(GamepadDriver):
     :class:`~hal.drivers.mock.faults.MockPadFaults`.
     """
 
+    kind: ClassVar[str] = "gamepad"
     simulated: ClassVar[bool] = True
     proves_liveness: bool = True
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
         self.faults = MockPadFaults()
-        self.is_open = False
         self.meant_for: str | None = None
         """Value of :attr:`mapping`."""
         self.rumbles: list[tuple[float, float, float]] = []
@@ -133,21 +133,13 @@ class MockPad(GamepadDriver):
         return "a mock pad"
 
     def inject(self, **faults: object) -> None:
-        """Set faults; those that are not named stay as they are.
-
-        Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.MockPadFaults` with their new values.
-
-        Raises:
-            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
-                (``bad_fault_value``); nothing changes.
-        """
-        self.faults = change_faults(self.faults, faults)
+        """Set faults: see :meth:`MockDevice.inject`."""
+        super().inject(**faults)
         self._news.set()
 
     def clear(self) -> None:
         """Remove every fault: the pad is plugged in and sends."""
-        self.faults = MockPadFaults()
+        super().clear()
         self._news.set()
 
     def close(self) -> None:

@@ -12,11 +12,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 from hal.driver import GripperDriver, GripperReading, Reading, RobotDriver, Setpoint
-from hal.errors import CommandError, ConnectionLost, Fault
+from hal.errors import CommandError, Fault
 from hal.specs import GripperSpec, RobotSpec
 from hal.types import GripperOutcome
 
-from .faults import MockGripperFaults, MockRobotFaults, change_faults
+from .faults import MockDevice, MockGripperFaults, MockRobotFaults
 
 LOG_LENGTH = 100_000
 """Number of set-points that ``MockRobot.log`` keeps: 100 s of the fastest arm."""
@@ -28,7 +28,7 @@ KEEP_UP = 0.020
 """How long the last torques act without new ones, s: as on a Franka."""
 
 
-class MockRobot(RobotDriver):
+class MockRobot(MockDevice[MockRobotFaults], RobotDriver):
     """An arm in memory. A set-point written after ``read(t)`` is where the arm is at the next ``read``.
 
     Set-points with torques drive each joint separately: a wheel of ``INERTIA`` with ``FRICTION``, without gravity.
@@ -38,6 +38,7 @@ class MockRobot(RobotDriver):
     again keeps the position, as a real arm's joints do. Faults: :class:`~hal.drivers.mock.faults.MockRobotFaults`.
     """
 
+    kind: ClassVar[str] = "arm"
     modes: ClassVar[frozenset[str]] = frozenset({"position", "torque"})
     simulated: ClassVar[bool] = True
 
@@ -46,7 +47,6 @@ class MockRobot(RobotDriver):
         self.faults = MockRobotFaults()
         self.log: deque[Setpoint] = deque(maxlen=LOG_LENGTH)
         """Every set-point written, oldest first, also those that the arm ignored because of a fault."""
-        self.is_open = False
         zeros = (0.0,) * len(spec.joints)
         self._follows = Setpoint(spec.initial, zeros, zeros)  # present position
         self._commanded = self._follows  # newest accepted set-point
@@ -154,15 +154,7 @@ class MockRobot(RobotDriver):
         self.inject(fault=None)
 
     def inject(self, **faults: object) -> None:
-        """Set faults; those that are not named stay as they are.
-
-        Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.MockRobotFaults` with their new values.
-
-        Raises:
-            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
-                (``bad_fault_value``); nothing changes.
-        """
+        """Set faults: see :meth:`MockDevice.inject`. The arm stops at a fault, and where it is unplugged."""
         sizes = {"following_error": len(self.spec.joints), "tau_ext": len(self.spec.joints), "wrench_ext": 6}
         for name, value in faults.items():
             if name in sizes and isinstance(value, Iterable):
@@ -171,16 +163,13 @@ class MockRobot(RobotDriver):
                     raise CommandError(
                         f"{name} must have {sizes[name]} numbers, not {len(numbers)}", code="bad_fault_value"
                     )
-        new = change_faults(self.faults, faults)
+        before = self.faults
+        super().inject(**faults)
         if "drop" in faults:
             self._written = 0
-        if (new.fault is not None and self.faults.fault is None) or (new.disconnect and not self.faults.disconnect):
+        new = self.faults
+        if (new.fault is not None and before.fault is None) or (new.disconnect and not before.disconnect):
             self._hold()
-        self.faults = new
-
-    def clear(self) -> None:
-        """Remove every fault."""
-        self.faults = MockRobotFaults()
 
     def close(self) -> None:
         if self.is_open:
@@ -191,23 +180,15 @@ class MockRobot(RobotDriver):
         error = self.faults.following_error
         return error if isinstance(error, Sequence) else (error,) * len(self.spec.joints)
 
-    def _expect_connected(self) -> None:
-        if self.faults.disconnect:
-            raise ConnectionLost(f"arm {self.spec.name!r} does not answer (the mock's fault 'disconnect')")
 
-    def _expect_open(self) -> None:
-        self._expect_connected()
-        if not self.is_open:
-            raise ConnectionLost(f"arm {self.spec.name!r} is not open")
-
-
-class MockGripper(GripperDriver):
+class MockGripper(MockDevice[MockGripperFaults], GripperDriver):
     """A gripper in memory, open at the start. Time is only the ``now`` of ``read``.
 
     Widths and speeds are clamped to the gripper's range, as by a gripper's own controller. Faults, and an object to
     hold: :class:`~hal.drivers.mock.faults.MockGripperFaults`.
     """
 
+    kind: ClassVar[str] = "gripper"
     simulated: ClassVar[bool] = True
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
@@ -217,7 +198,6 @@ class MockGripper(GripperDriver):
         """Every ``move`` and ``grasp``: width in m, speed in m/s, force in N."""
         self.homed = 0
         """Number of calls of ``home``."""
-        self.is_open = False
         self._width = self._target = spec.width_max
         self._speed = 0.0
         self._force = 0.0
@@ -303,31 +283,6 @@ class MockGripper(GripperDriver):
         self._expect_open()
         self._stopped = True
 
-    def inject(self, **faults: object) -> None:
-        """Set faults; those that are not named stay as they are.
-
-        Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.MockGripperFaults` with their new values.
-
-        Raises:
-            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
-                (``bad_fault_value``); nothing changes.
-        """
-        self.faults = change_faults(self.faults, faults)
-
-    def clear(self) -> None:
-        """Remove every fault, and the object."""
-        self.faults = MockGripperFaults()
-
     def close(self) -> None:
         self._stopped = True
         self.is_open = False
-
-    def _expect_connected(self) -> None:
-        if self.faults.disconnect:
-            raise ConnectionLost(f"gripper {self.spec.name!r} does not answer (the mock's fault 'disconnect')")
-
-    def _expect_open(self) -> None:
-        self._expect_connected()
-        if not self.is_open:
-            raise ConnectionLost(f"gripper {self.spec.name!r} is not open")

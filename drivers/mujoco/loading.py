@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from hal.drivers.scene.gripper import FingerTravel
 from hal.drivers.scene.records import (
-    SHAPES,
     check_names,
     followers_of,
     hulls_of,
     joint_drives,
     mimics_of,
     pad_links,
-    required,
+    primitive_size,
 )
 from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless, mesh_points
 from hal.drivers.scene.values import listed
@@ -308,19 +307,12 @@ def _contact(link: ElementTree.Element) -> LinkContact:
 
 
 def _primitive(spec: BodySpec) -> Shape:
-    if spec.shape == "box":
-        if spec.half_extents is None:
-            message = "is missing, and a box needs it"
-            raise ConfigError([Problem("objects", f"objects.{spec.name}.half_extents", message, "missing_key")])
-        return Shape("box", tuple(spec.half_extents), Pose())
-    if spec.shape == "sphere":
-        return Shape("sphere", (required(spec, "radius"),), Pose())
+    size = primitive_size(spec)
     if spec.shape in ("cylinder", "capsule"):
-        return Shape(spec.shape, (required(spec, "radius"), required(spec, "length") / 2.0), Pose())
-    if spec.shape == "plane":  # infinite in contacts
-        return Shape("plane", (0.0, 0.0, 1.0), Pose())
-    message = f"is {spec.shape!r}; shapes: {SHAPES}"
-    raise ConfigError([Problem("objects", f"objects.{spec.name}.shape", message, "unknown_shape")])
+        size = (size[0], size[1] / 2.0)
+    elif spec.shape == "plane":  # infinite in contacts
+        size = (0.0, 0.0, 1.0)
+    return Shape(spec.shape, size, Pose())
 
 
 def _shapes(link: UrdfLink, scale: float, sliced: bool) -> Iterator[Shape]:

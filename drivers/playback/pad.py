@@ -23,11 +23,12 @@ from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from hal.config.files import check_record
 from hal.driver import GamepadDriver, PadReading
 from hal.errors import ConfigError, ConnectionLost, Problem
 from hal.pads.codes import ABS, ABS_NAME, EV_ABS, EV_KEY, KEY, KEY_NAME
 from hal.pads.mapper import AxisRange, PadMapper
-from hal.pads.model import PadModel, check_record, pad_model
+from hal.pads.model import PadModel, pad_model
 from hal.specs import PadSpec
 
 Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -106,7 +107,6 @@ class PlaybackPad(GamepadDriver):
         raise ConfigError([Problem(file, "line 1", message, code="unknown_model")])
 
     def poll(self, now: float, timeout: float) -> PadReading:
-        """See :meth:`GamepadDriver.poll`."""
         mapper = self._mapper
         if mapper is None:
             raise ConnectionLost(f"the recording {self._options.file.name} is not open", code="not_open")
@@ -186,11 +186,9 @@ class PlaybackPad(GamepadDriver):
 
     @property
     def control_names(self) -> Mapping[str, str]:
-        """See :meth:`GamepadDriver.control_names`."""
         return self._mapper.model.control_names if self._mapper is not None else {}
 
     def describe(self) -> str:
-        """See :meth:`GamepadDriver.describe`."""
         return f"replaying {self._options.file.name}"
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.drivers.scene.drawn import PLANE
-from hal.drivers.scene.records import SHAPES, check_names, hulls_of, joint_drives, mimics_of, pad_links, required
+from hal.drivers.scene.records import check_names, hulls_of, joint_drives, mimics_of, pad_links, primitive_size
 from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless, mesh_points
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
@@ -59,7 +59,7 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> 
     if spec.shape == "mesh":
         return _describe(client, spec, _make_mesh(client, spec, key, drawn), key), []
     if spec.shape != "urdf":
-        number = _make_shape(client, spec, key, drawn)
+        number = _make_shape(client, spec, drawn)
         body = _describe(client, spec, number, key)
         return body, []
     if spec.urdf is None:
@@ -205,27 +205,23 @@ def _load_urdf(
     return number
 
 
-def _make_shape(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -> int:
+def _make_shape(client: PyBulletClient, spec: BodySpec, drawn: bool) -> int:
     at: Sequence[float] = (0.0, 0.0, 0.0)
+    size = primitive_size(spec)
     if spec.shape == "box":
-        if spec.half_extents is None:
-            message = "is missing, and a box needs it"
-            raise ConfigError([Problem("objects", f"{key}.half_extents", message, "missing_key")])
-        solid = seen = {"shapeType": client.GEOM_BOX, "halfExtents": spec.half_extents}
+        solid = seen = {"shapeType": client.GEOM_BOX, "halfExtents": size}
     elif spec.shape == "sphere":
-        solid = seen = {"shapeType": client.GEOM_SPHERE, "radius": required(spec, "radius")}
-    elif spec.shape in ("cylinder", "capsule"):
-        kind = client.GEOM_CYLINDER if spec.shape == "cylinder" else client.GEOM_CAPSULE
-        solid = {"shapeType": kind, "radius": required(spec, "radius"), "height": required(spec, "length")}
-        seen = {"shapeType": kind, "radius": required(spec, "radius"), "length": required(spec, "length")}
+        solid = seen = {"shapeType": client.GEOM_SPHERE, "radius": size[0]}
     elif spec.shape == "plane":  # infinite in contacts; drawn as a thin box whose upper face is the plane
         x, y = (spec.half_extents or (*PLANE, 0.0))[:2]
         solid = {"shapeType": client.GEOM_PLANE, "planeNormal": (0.0, 0.0, 1.0)}
         seen = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
         at = (0.0, 0.0, -0.005)
     else:
-        message = f"is {spec.shape!r}; shapes: {SHAPES}"
-        raise ConfigError([Problem("objects", f"{key}.shape", message, "unknown_shape")])
+        radius, length = size
+        kind = client.GEOM_CYLINDER if spec.shape == "cylinder" else client.GEOM_CAPSULE
+        solid = {"shapeType": kind, "radius": radius, "height": length}
+        seen = {"shapeType": kind, "radius": radius, "length": length}
     shape = client.createCollisionShape(**solid) if spec.collision else -1
     visual = -1
     if drawn and spec.visible:

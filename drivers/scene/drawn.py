@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hal.errors import ConfigError, DeviceNotFound, Problem
 from hal.geometry import Pose, matrix_to_quaternion
-from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfModel
+from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfModel, UrdfVisual
 from hal.randomization import COUNT
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
@@ -337,20 +337,17 @@ def _body(number: int, spec: BodySpec | RobotSpec, urdf: UrdfModel | None) -> Dr
     scale = 1.0 if isinstance(spec, RobotSpec) else spec.scale
     links = {link: k for k, link in enumerate((urdf.root, *(joint.child for joint in urdf.outwards)))}
     visuals = tuple(
-        Visual(
-            links[name],
-            shape.shape,
-            tuple(scale * part for part in shape.size),
-            shape.file,
-            tuple(scale * shape.pose.position),
-            tuple(shape.pose.orientation),
-            _single(shape.rgba or (1.0, 1.0, 1.0, 1.0)),
-        )
-        for name, link in urdf.links.items()
-        for shape in drawn_visuals(link)
+        link_visual(shape, links[name], scale) for name, link in urdf.links.items() for shape in drawn_visuals(link)
     )
     movable = tuple(name for name, joint in urdf.joints.items() if joint.movable)
     return DrawnBody(number, spec, links, urdf.outwards, movable, visuals, roams, scale)
+
+
+def link_visual(shape: UrdfVisual, link: int = 0, scale: float = 1.0) -> Visual:
+    """Return a shape of a URDF as it is drawn, in the frame of its link."""
+    size, position = tuple(scale * part for part in shape.size), tuple(scale * shape.pose.position)
+    rgba = _single(shape.rgba or (1.0, 1.0, 1.0, 1.0))
+    return Visual(link, shape.shape, size, shape.file, position, tuple(shape.pose.orientation), rgba)
 
 
 def _primitive(spec: BodySpec) -> tuple[Visual, ...]:

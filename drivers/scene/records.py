@@ -12,8 +12,14 @@ from hal.specs import BodySpec, GripperSpec, RobotSpec
 
 from .values import listed
 
-SHAPES = "box, sphere, cylinder, capsule, plane, mesh, urdf"
-"""Shapes of objects, for messages."""
+_PRIMITIVES = {
+    "box": ("half_extents",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "plane": (),
+}
+"""Shapes of objects that need no file -> the sizes that each needs."""
 PAD_FRICTION = (1.0, 0.1)
 """Lateral and spinning friction of a gripper's pads: rubber."""
 UNKNOWN_EFFORT = 200.0
@@ -22,13 +28,21 @@ UNKNOWN_SPEED = 2.0
 """Speed, rad/s or m/s, of a joint without a limit."""
 
 
-def required(spec: BodySpec, name: str) -> float:
-    """Return a size that an object's shape needs; raises ConfigError if the record lacks it."""
-    value = getattr(spec, name)
-    if value is None:
-        message = f"is missing, and a {spec.shape} needs it"
-        raise ConfigError([Problem("objects", f"objects.{spec.name}.{name}", message, "missing_key")])
-    return float(value)
+def primitive_size(spec: BodySpec) -> tuple[float, ...]:
+    """Return the size of a primitive shape, m: half extents of a box, radius, or radius and length; a plane has none.
+
+    Raises:
+        ConfigError: The record lacks it, or there is no such shape.
+    """
+    if spec.shape not in _PRIMITIVES:
+        message = f"is {spec.shape!r}; shapes: {', '.join(_PRIMITIVES)}, mesh, urdf"
+        raise ConfigError([Problem("objects", f"objects.{spec.name}.shape", message, "unknown_shape")])
+    for name in _PRIMITIVES[spec.shape]:
+        if getattr(spec, name) is None:
+            message = f"is missing, and a {spec.shape} needs it"
+            raise ConfigError([Problem("objects", f"objects.{spec.name}.{name}", message, "missing_key")])
+    sizes = [getattr(spec, name) for name in _PRIMITIVES[spec.shape]]
+    return tuple(float(side) for side in (sizes[0] if spec.shape == "box" else sizes))
 
 
 def hulls_of(spec: BodySpec) -> tuple[Hull, ...]:

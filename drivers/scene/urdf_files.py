@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import ConfigError, Problem
-from hal.kinematics.hulls import mesh_parts
+from hal.kinematics.hulls import exact_hull, mesh_parts
 from hal.kinematics.mesh_files import PACKAGE, mesh_file, package_folder
 from hal.kinematics.urdf import UrdfLink, UrdfModel, UrdfVisual, parse_xml, read_urdf
 from hal.specs import BodySpec
@@ -167,7 +167,7 @@ def _solid_parts(file: Path, sliced: bool) -> list[NDArray[np.float64]]:
     try:
         mesh: Any = trimesh.load(str(file), force="mesh")
         points = np.array(mesh.vertices, dtype=np.float64)
-        if not sliced or mesh.volume >= HOLLOW * mesh.convex_hull.volume:
+        if not sliced or mesh.volume >= HOLLOW * exact_hull(points).volume:
             return [points]
         edges = points[mesh.edges_unique]
     except Exception as error:  # whatever the reader of that format raises

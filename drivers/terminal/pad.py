@@ -6,9 +6,9 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 
+from hal.config.files import check_record
 from hal.driver import GamepadDriver, PadReading
 from hal.pads.keyboard import keyboard_table
-from hal.pads.model import check_record
 from hal.specs import PadSpec
 
 from .controls import HELP, RELEASED, STOP_KEYS, PadControls, StepControls, TerminalOptions

@@ -1,15 +1,18 @@
-"""Pre-flight check of a UR arm: reachable, ready for a program, its speed, tcp and payload, and late states.
+"""Pre-flight check of a UR arm: reachable, ready for a program, calibration, tcp and payload, and late states.
 
 Nothing moves, and no program is started. Checks run in the order in which they can succeed.
 """
 
 from __future__ import annotations
 
+import socket
+import struct
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.errors import ConnectionLost, ControlTaken
 from hal.geometry import Pose
@@ -34,6 +37,10 @@ from .settings import UrSettings
 
 _FAR, _TURNED = 0.001, 0.005
 """Difference of two tcps that is named, m and rad."""
+_NOMINAL, _OTHER_ARM = 5e-5, 0.015
+"""Largest difference of two tcps without a calibration, and with one, m: users report up to 10 mm."""
+_PRIMARY = 30001
+"""Port of the primary interface."""
 _LATE = 2.5
 """Periods without a state from which one is late."""
 
@@ -59,6 +66,8 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         link.open()
         yield CheckResult("controller", "ok", f"{settings.host} answers; PolyScope {link.version}, {link.rate:g} Hz")
         yield from _check_state(link)
+        if find_tcp(spec) is not None:
+            yield _check_calibration(spec, settings.host)
         yield _check_tcp(spec, settings, link.receive)
         yield _check_payload(settings, link)
         yield _check_states(spec, link, duration)
@@ -85,6 +94,52 @@ def _check_state(link: UrLink) -> Iterator[CheckResult]:
         yield CheckResult("state", "ok", "ready to move")
 
 
+def _check_calibration(spec: RobotSpec, host: str) -> CheckResult:
+    """Compare the tcp of the controller's lengths and angles with the model's, at home and at random positions."""
+    try:
+        parameters = _read_kinematics(host)
+    except (OSError, struct.error) as error:
+        remedy = "allow the primary interface (Settings, Security, Services)"
+        return CheckResult("calibration", "unknown", f"port {_PRIMARY} of {host}: {error}", remedy)
+    kinematics, tcp = Kinematics(spec.kinematics), Pose(spec.kinematics.tcp_position, spec.kinematics.tcp_orientation)
+    apart = [
+        float(np.linalg.norm((_find_flange(parameters, q) @ tcp).position - kinematics.pose(q).position))
+        for q in [np.array(spec.home), *np.random.default_rng(0).uniform(-np.pi, np.pi, (300, 6))]
+    ]
+    found = f"the model's tcp is off by up to {1e3 * max(apart):.1f} mm, by {1e3 * apart[0]:.1f} mm at home"
+    if max(apart) > _OTHER_ARM:
+        return CheckResult("calibration", "fail", found, f"this is no {spec.model}: name its model in the rig")
+    if max(apart) < _NOMINAL:
+        return CheckResult("calibration", "ok", "none: the controller has the nominal lengths, as the model has")
+    return CheckResult("calibration", "ok", f"a factory calibration, not used here: {found}")
+
+
+def _read_kinematics(host: str) -> NDArray[np.float64]:
+    """Return the controller's DH parameters (4, 6): theta, rad, added to the joint positions; a and d, m; alpha, rad.
+
+    From the first message of the primary interface, as UniversalRobots/Universal_Robots_Client_Library reads it.
+    """
+    with socket.create_connection((host, _PRIMARY), 2.0) as line, line.makefile("rb") as stream:
+        for _ in range(20):
+            size, kind = struct.unpack(">iB", stream.read(5))
+            parts = stream.read(min(max(size - 5, 0), 1 << 16))
+            while kind == 16 and parts:  # a state of the robot
+                length, part = struct.unpack(">iB", parts[:5])
+                if part == 5:  # after six checksums
+                    return np.array(struct.unpack(">24d", parts[29:221])).reshape(4, 6)
+                parts = parts[max(length, 5) :]
+    raise OSError("it sends no kinematics")
+
+
+def _find_flange(parameters: NDArray[np.float64], q: NDArray[np.float64]) -> Pose:
+    """Return the pose of the flange that DH parameters give, in the base of UR's models."""
+    pose = np.diag([-1.0, -1.0, 1.0, 1.0])
+    for angle, (theta, a, d, alpha) in zip(q, parameters.T, strict=True):
+        c, s, ca, sa = np.cos(angle + theta), np.sin(angle + theta), np.cos(alpha), np.sin(alpha)
+        pose = pose @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+    return Pose.from_matrix(pose)
+
+
 def _check_tcp(spec: RobotSpec, settings: UrSettings, receive: Any) -> CheckResult:
     """Compare the controller's tcp with the model's: they differ by the installation's tcp, and by the calibration."""
     x, y, z, *turn = receive.getActualTCPPose()
@@ -98,7 +153,7 @@ def _check_tcp(spec: RobotSpec, settings: UrSettings, receive: Any) -> CheckResu
         return CheckResult("tcp", "ok", found)
     sets = settings.set_tcp and find_tcp(spec) is not None
     remedy = "the model's is set when a session opens" if sets else "set the model's in the installation"
-    remedy += "; what stays then is the factory calibration, which this driver does not use: poses have that error"
+    remedy += "; what stays then is the factory calibration"
     return CheckResult("tcp", "warn", found, remedy)
 
 

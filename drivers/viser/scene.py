@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
-from hal.drivers.scene.drawn import DrawnBody, DrawnWorld
+from hal.drivers.scene.drawn import DrawnBody, DrawnWorld, link_visual
 from hal.drivers.scene.mirror import WorldMirror
 from hal.drivers.scene.shapes import Visual
 from hal.drivers.scene.urdf_files import absent_packages, drawn_visuals, where_to_get
@@ -32,7 +32,6 @@ Vector = Sequence[float] | NDArray[np.float64]
 _OPEN_SIDE = 0.8
 """Distance from the base at which an open side of a workspace is drawn, m."""
 _AMBER = (230, 150, 30)
-_WHITE = (1.0, 1.0, 1.0, 1.0)
 _AT_REST = 1e-5
 """A node that moves by less is not updated, m and parts of a quaternion: an arm at rest costs no messages."""
 
@@ -265,18 +264,7 @@ def shown_visuals(urdf: UrdfModel, name: str, notes: list[str]) -> dict[str, lis
     absent = absent_packages(str(urdf.path))
     notes += [f"{name}: drawn with plain shapes; the meshes are in {where_to_get(package)}" for package in absent]
     return {
-        key: [
-            Visual(
-                0,
-                shape.shape,
-                shape.size,
-                shape.file,
-                tuple(shape.pose.position),
-                tuple(shape.pose.orientation),
-                shape.rgba or _WHITE,
-            )
-            for shape in (drawn_visuals(link) if absent else link.visuals)
-        ]
+        key: [link_visual(shape) for shape in (drawn_visuals(link) if absent else link.visuals)]
         for key, link in urdf.links.items()
     }
 

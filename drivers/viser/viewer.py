@@ -74,7 +74,6 @@ class ViserViewer(Viewer3D):
         self._child = Child("3D viewer", "hal.drivers.viser.process:main", config, [group.memory for group in groups])
 
     def wait_ready(self) -> None:
-        """See :meth:`Viewer3D.wait_ready`."""
         ready = self._child.wait_ready()
         self._address = ready["address"]
         self.notes = tuple(f"3D view: {note}" for note in dict.fromkeys(ready["notes"]))
@@ -83,7 +82,6 @@ class ViserViewer(Viewer3D):
 
     @property
     def link(self) -> str:
-        """See :attr:`Viewer3D.link`."""
         return f"{self._address}/?token={self._secret}"
 
     def goal(self, robot: str) -> Pose | None:
@@ -149,11 +147,9 @@ class ViserViewer(Viewer3D):
             self._goals = {robot: goal for robot, goal in reported.items() if goal.seq > self._cleared[robot]}
 
     def describe(self) -> str:
-        """See :meth:`Viewer3D.describe`."""
         return f"viser {version('viser')}"
 
     def close(self) -> None:
-        """See :meth:`Viewer3D.close`."""
         self._closed.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)

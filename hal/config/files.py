@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, TypeAdapter, ValidationError
 
 from ..errors import ConfigError, Problem
 from ..specs import CameraSpec, GripperSpec, RobotSpec
@@ -77,6 +77,17 @@ def suggest(word: str, choices: Iterable[str]) -> str:
     close = find_closest(word, known)
     hint = f"; did you mean {close!r}?" if close else ";"
     return f"{hint} available: {', '.join(known)}" if known else "; none are available"
+
+
+def one_of(kind: str, names: Collection[str]) -> AfterValidator:
+    """Return a check, for an ``Annotated`` type, that a name is one of ``names``, which are those of a ``kind``."""
+
+    def check(name: str) -> str:
+        if name not in names:
+            raise ValueProblem(f"{name!r} is not a known {kind}{suggest(name, names)}", "unknown_control")
+        return name
+
+    return AfterValidator(check)
 
 
 def copy_plain(value: Any) -> Any:
@@ -301,16 +312,22 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
                 problems.written[str(file), _join_key(prefix, right)] = str(one["loc"][-1])
 
 
+def check_record(model: type[M], data: Any, file: Path | str) -> M:
+    """Return plain data as a record. Raises ConfigError, which lists every problem; ``file`` is the name in them."""
+    problems = Problems()
+    record = validate(model, data, file, problems)
+    problems.raise_any()
+    return record
+
+
 class DeviceSettings(Strict):
     """Base of the settings that a driver takes under ``real:`` of a device."""
 
     @classmethod
     def of(cls: type[M], spec: RobotSpec | GripperSpec | CameraSpec) -> M:
         """Return the settings in a device's record. Raises ConfigError, which lists every problem."""
-        problems, section = Problems(), "cameras" if isinstance(spec, CameraSpec) else "robots"
-        settings = validate(cls, spec.options, f"{section}.{spec.name}.real", problems)
-        problems.raise_any()
-        return settings
+        section = "cameras" if isinstance(spec, CameraSpec) else "robots"
+        return check_record(cls, spec.options, f"{section}.{spec.name}.real")
 
     @classmethod
     def check(cls: type[M], spec: RobotSpec | GripperSpec | CameraSpec) -> tuple[M | None, list[tuple[str, str, str]]]:
@@ -339,19 +356,16 @@ def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folde
     """
     if isinstance(given, model):
         return given
+    if isinstance(given, Mapping):
+        return check_record(model, given, "<dict>")
+    name = given if isinstance(given, Path) else str(given)
+    file = find_file(name, kind.replace("_", " "), Path.cwd(), "config", folder)
+    if isinstance(file, str):
+        raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), file, f"unknown_{kind}")])
     problems = Problems()
-    file: Path | str = "<dict>"
-    data: Any = given
-    if not isinstance(given, Mapping):
-        name = given if isinstance(given, Path) else str(given)
-        file = find_file(name, kind.replace("_", " "), Path.cwd(), "config", folder)
-        if isinstance(file, str):
-            raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), file, f"unknown_{kind}")])
-        data = read_yaml(file, problems)
-        problems.raise_any()
-    result = validate(model, data, file, problems)
+    data = read_yaml(file, problems)
     problems.raise_any()
-    return result
+    return check_record(model, data, file)
 
 
 def find_file(given: str | Path, kind: str, base: Path, folder: str, *parts: str) -> Path | str:
@@ -429,7 +443,6 @@ def _join_key(prefix: str, place: Place) -> str:
 
 
 def _explain_error(model: type[BaseModel], found: Any) -> tuple[str, str]:
-    """Return message and code of one of pydantic's errors."""
     kind, loc, given = found["type"], found["loc"], found["input"]
     if kind == "missing":
         return "is missing", "missing_key"

@@ -227,7 +227,6 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
 
 
 def _find_file(entry: object, source: str, base: Path, key: str, problems: Problems) -> Path | None:
-    """Return the file of an object; None, with the problem added, if there is none."""
     if not isinstance(entry, str):
         message, code = f"must be a file, a name or keys and values, not {describe(entry)}", "wrong_type"
     elif isinstance(path := find_file(entry, "object", base, "config", "objects"), str):

@@ -94,7 +94,6 @@ def _light(config: LightVariation) -> Iterator[VariationSpec]:
 
 
 def _links_of(body: BodySpec) -> dict[str, str]:
-    """Return the names of an object's links."""
     names = ("base",) if body.urdf is None else tuple(read_urdf(Path(body.urdf)).links)
     return {name: name for name in names}
 

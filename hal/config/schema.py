@@ -203,7 +203,6 @@ _LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
 
 
 def _host(value: Any) -> str:
-    """An IPv4 address or a host name."""
     advice = "must be the robot's address, for example 172.16.0.2, without scheme and port"
     if not isinstance(value, str):
         raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address")

@@ -40,6 +40,12 @@ class Hull:
     faces: NDArray[np.intp]
     """(m, 3) indices of corners, counter-clockwise from outside."""
 
+    @property
+    def volume(self) -> float:
+        """Its volume, m3."""
+        a, b, c = (self.points[self.faces[:, k]] - self.points[0] for k in range(3))
+        return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6.0)
+
 
 class Solid(NamedTuple):
     """How a mass of 1 kg is spread."""
@@ -150,15 +156,15 @@ def convex_hull(points: Array) -> Hull:
     if spread[2] <= FLAT * max(spread[0], 1e-9):
         raise ValueError("is flat, and has no hull; use a thin box")
     if len(points) <= MOST:
-        return _qhull(points)
+        return exact_hull(points)
     chosen = np.unique(np.concatenate([(part @ points.T).argmax(axis=1) for part in np.array_split(_sphere(), 16)]))
-    hull = _qhull(points[chosen])
+    hull = exact_hull(points[chosen])
     for _ in range(ROUNDS):
         outside = _find_outside(points, hull, EXACT * extent)
         if not len(outside):
             break
         chosen = np.union1d(chosen, outside)
-        hull = _qhull(points[chosen])
+        hull = exact_hull(points[chosen])
     return hull
 
 
@@ -186,7 +192,8 @@ def _find_outside(points: Array, hull: Hull, tolerance: float) -> NDArray[np.int
     return np.unique(np.concatenate(found))
 
 
-def _qhull(points: Array) -> Hull:
+def exact_hull(points: Array) -> Hull:
+    """Return the convex hull of points (n, 3) with all its corners. Raises ValueError if it cannot be made."""
     import coal  # with pinocchio
 
     middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())

@@ -250,7 +250,6 @@ class RemotePolicy:
             self.config = self.config.resize_pictures(*size)
 
     def _read_metadata(self, metadata: dict[str, Any]) -> PolicyConfig:
-        """Return the configuration that a server describes in its metadata."""
         if "policy_config" not in metadata:
             raise PolicyError(
                 f"{self.client.url} does not describe its policy; pass a configuration (--policy-config)",
@@ -457,7 +456,6 @@ class RemotePolicy:
 
 
 def _is_size(size: Any) -> bool:
-    """Return whether this is a height and a width in pixels."""
     sound = isinstance(size, list | tuple) and len(size) == 2
     return sound and all(type(pixels) is int and 8 <= pixels <= 4096 for pixels in size)
 

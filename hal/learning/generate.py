@@ -238,7 +238,6 @@ class _GenerateRun:
         return sorted(self._parts.glob("worker-*"))
 
     def make_missing(self, workers: int, on_progress: Callable[[GenerateProgress], object]) -> list[EpisodeResult]:
-        """Make every episode that is missing."""
         count = min(workers, len(self._left))
         if count:
             self._parts.mkdir(parents=True, exist_ok=True)

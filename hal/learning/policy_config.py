@@ -479,7 +479,6 @@ def _read_state(name: str, observation: Observation, robot: Robot) -> Array:
 
 
 def _fit_picture(color: NDArray[np.uint8], source: Source) -> NDArray[np.uint8]:
-    """Return a picture in the size and the layout of its source."""
     if source.size is not None and color.shape[:2] != source.size:
         from PIL import Image
 

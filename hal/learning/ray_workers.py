@@ -137,19 +137,15 @@ class _EpisodeActor:
         return {"result": None}
 
     def start(self, *config: Any) -> dict[str, Any]:
-        """Make the :class:`.EpisodeWorker`."""
-
         def start() -> None:
             self.worker = EpisodeWorker(*config)
 
         return _pack_result(start)
 
     def make(self, number: int) -> dict[str, Any]:
-        """Make an episode."""
         return _pack_result(lambda: self.worker.make(number))
 
     def close(self) -> dict[str, Any]:
-        """End the worker's recorder."""
         return _pack_result(self.worker.close)
 
 

@@ -387,7 +387,6 @@ def _aiohttp() -> Any:
 
 
 def _server_error(text: str) -> PolicyError:
-    """Return the error that a server has sent as a text."""
     last = (text.strip().splitlines() or [""])[-1].removeprefix(_ERROR)
     return PolicyError(f"the policy's server reports: {last[:500]}", code="policy_error")
 

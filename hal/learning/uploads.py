@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import CommandError, ConnectionLost, DriverMissing
-from ..recording.layout import GROUP
+from ..recording.layout import GROUP, file_version
 
 _RECIPE = "recipe.json"
 _NAME = re.compile(r"(?P<part>[0-9a-f]+)/\d{6}\.(?P<number>\d+)\.(?P<mark>none|false|true)\.zip")
@@ -158,7 +158,7 @@ class EpisodeUploader:
         self._part = uuid.uuid4().hex
         self.folder = self._scratch / self._part
         """The dataset."""
-        self._seen: dict[Path, tuple[int, ...]] = {}
+        self._seen: dict[Path, tuple[int, int] | None] = {}
         self._count = 0
         for path in self._scratch.iterdir():
             if path.is_dir():
@@ -180,7 +180,7 @@ class EpisodeUploader:
             ConnectionLost: It cannot be uploaded (code ``upload_failed``).
         """
         files = [path for path in self.folder.rglob("*") if path.is_file() and path.name != ".lock"]
-        new = {path: _version(path) for path in files}
+        new = {path: file_version(path) for path in files}
         mark_name = next(name for name, value in _MARKS.items() if value is mark)
         place = f"{self._root}/{self._part}/{self._count:06d}.{number}.{mark_name}.zip"
         packed = self._scratch / "episode.zip"
@@ -208,12 +208,6 @@ def _lost(what: str) -> Iterator[None]:
         yield
     except Exception as error:
         raise ConnectionLost(f"{what}: {type(error).__name__}: {error}", code="upload_failed") from error
-
-
-def _version(path: Path) -> tuple[int, ...]:
-    """Return numbers that change when a file is written."""
-    found = path.stat()
-    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _lock(folder: Path) -> int:

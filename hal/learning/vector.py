@@ -386,12 +386,10 @@ class _Worlds:
         return 0.0
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
-        """Call a method of every world, or read an attribute."""
         found = [env.get_wrapper_attr(name) for env in self._envs]
         return self._run_each(lambda k: found[k](*args, **kwargs) if callable(found[k]) else found[k])
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """Set an attribute of every world."""
         for env, value in zip(self._envs, values, strict=True):
             env.set_wrapper_attr(name, value)
 

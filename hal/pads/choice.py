@@ -110,7 +110,6 @@ def _choose_auto(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
 
 
 def _list_plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the gamepads that are plugged in, and notes."""
     try:
         found = registry.load(registry.pad_driver("plugged"), "gamepad").list_plugged()
     except (DriverMissing, NotSupported) as error:

@@ -39,7 +39,6 @@ class _Axis(NamedTuple):
     range: AxisRange
 
     def value(self, raw: int) -> float:
-        """Return the canonical value."""
         one_sided = self.control in ONE_SIDED
         share = self.range.normalise(raw, one_sided)
         return 1.0 - share if one_sided and self.sign < 0.0 else self.sign * share + 0.0  # no -0.0
@@ -188,5 +187,4 @@ class PadMapper:
 
 
 def _measure_range(control: str) -> float:
-    """Return the length of an axis' canonical range."""
     return 1.0 if control in ONE_SIDED else 2.0

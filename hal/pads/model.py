@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import AfterValidator, BaseModel, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from ..config.files import Problems, suggest, validate
+from ..config.files import check_record, one_of
 from ..config.schema import Strict, ValueProblem
 from ..types import AXES, BUTTONS
 from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
@@ -54,7 +54,6 @@ PRINTED: Mapping[str, Mapping[str, str]] = {
 }
 """Family of pads -> control -> its name as printed on the pad, or how it is moved."""
 
-_M = TypeVar("_M", bound=BaseModel)
 _BUSES = {BUS_USB: "usb", BUS_BLUETOOTH: "bluetooth"}
 _AXIS_CODES = (*ABS, *REL)
 
@@ -74,15 +73,6 @@ class Identity(NamedTuple):
     def bus_name(self) -> str:
         """``usb``, ``bluetooth`` or ``other``."""
         return _BUSES.get(self.bus, "other")
-
-
-def _check_name(kind: str, names: Collection[str]) -> AfterValidator:
-    def check(name: str) -> str:
-        if name not in names:
-            raise ValueProblem(f"{name!r} is not a known {kind}{suggest(name, names)}", "unknown_control")
-        return name
-
-    return AfterValidator(check)
 
 
 def _axis(text: str) -> str:
@@ -109,7 +99,7 @@ class MatchRule(Strict):
     """Part of the device's name; the case does not matter."""
     driver: str | None = None
     """The kernel's driver: the same pad has other event codes with another driver."""
-    bus: Annotated[str, _check_name("bus", ("usb", "bluetooth"))] | None = None
+    bus: Annotated[str, one_of("bus", ("usb", "bluetooth"))] | None = None
     wireless: bool = False
     """Whether the device is only the receiver of a wireless pad, so that it stays when the pad is gone."""
     title: str | None = None
@@ -134,23 +124,23 @@ class PadModel(Strict):
     title: str
     """Name to display."""
     match: tuple[MatchRule, ...] = ()
-    axes: dict[Annotated[str, _check_name("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
+    axes: dict[Annotated[str, one_of("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
     """Event code -> axis, or ``-axis`` where the kernel's value grows the other way (on sticks, downwards). Codes that
     a pad does not send are allowed."""
-    buttons: dict[Annotated[str, _check_name("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
+    buttons: dict[Annotated[str, one_of("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
     """Event code -> button; ``+dpad_y`` etc. where the directions of the d-pad are buttons."""
-    ranges: dict[Annotated[str, _check_name("event code of an axis", _AXIS_CODES)], tuple[int, int]] = Field(
+    ranges: dict[Annotated[str, one_of("event code of an axis", _AXIS_CODES)], tuple[int, int]] = Field(
         default_factory=dict
     )
     """Event code -> (minimum, maximum): required for ``REL_`` axes, which report none, and for axes whose reported
     range is wrong."""
-    absolute: tuple[Annotated[str, _check_name("axis", [name for name in AXES if name not in BUTTONS])], ...] = ()
+    absolute: tuple[Annotated[str, one_of("axis", [name for name in AXES if name not in BUTTONS])], ...] = ()
     """Axes that stay where they are put, such as levers; none that is also a button, for a dead-man springs back."""
     motion_node: str | None = None
     """End of the name of the pad's motion sensor, which reports all the time and so shows that the pad is connected."""
     touch_node: str | None = None
     """End of the name of the pad's touchpad, a separate device; pressing it is the button ``touchpad``."""
-    printed: Annotated[str, _check_name("family of pads", PRINTED)] | None = None
+    printed: Annotated[str, one_of("family of pads", PRINTED)] | None = None
     """Family of pads (of :data:`PRINTED`) whose names of the controls this pad has; None for plain names."""
     mapping: str | None = None
     """Teleoperation mapping for this pad (``config/teleop``); default: ``default``."""
@@ -178,14 +168,6 @@ class PadModel(Strict):
 
         text: str = yaml.safe_dump(self.model_dump(exclude_defaults=True, mode="json"), sort_keys=False)
         return re.sub(r"(vendor|product): (\d+)$", lambda m: f"{m[1]}: 0x{int(m[2]):04x}", text, flags=re.MULTILINE)
-
-
-def check_record(cls: type[_M], data: Mapping[str, Any], file: str) -> _M:
-    """Return ``data`` as a record. Raises ConfigError, which lists every problem; ``file`` is the name in them."""
-    problems = Problems()
-    record = validate(cls, data, file, problems)
-    problems.raise_any()
-    return record
 
 
 def pad_model(data: Mapping[str, Any], file: str = "<gamepad model>") -> PadModel:

@@ -16,16 +16,12 @@ further files (docs/record.md). Needs ``pip install 'robot-hal[record]'``; impor
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from .changing import mark_episodes
-    from .curation import find_motion, split, trim
-    from .dataset import CameraDepth, Dataset, Episode, EpisodeDepth, KeptRows
-    from .merging import delete_episodes, extract, merge, pack, set_task
-    from .recorder import Recorder, RecorderStatus
-    from .repairing import recover, repair
+from .changing import mark_episodes
+from .curation import find_motion, split, trim
+from .dataset import CameraDepth, Dataset, Episode, EpisodeDepth, KeptRows
+from .merging import delete_episodes, extract, merge, pack, set_task
+from .recorder import Recorder, RecorderStatus
+from .repairing import recover, repair
 
 __all__ = [
     "CameraDepth",
@@ -47,36 +43,3 @@ __all__ = [
     "split",
     "trim",
 ]
-
-_HOME = {
-    "CameraDepth": "dataset",
-    "Dataset": "dataset",
-    "Episode": "dataset",
-    "EpisodeDepth": "dataset",
-    "KeptRows": "dataset",
-    "Recorder": "recorder",
-    "RecorderStatus": "recorder",
-    "delete_episodes": "merging",
-    "extract": "merging",
-    "find_motion": "curation",
-    "mark_episodes": "changing",
-    "merge": "merging",
-    "pack": "merging",
-    "recover": "repairing",
-    "repair": "repairing",
-    "set_task": "merging",
-    "split": "curation",
-    "trim": "curation",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'hal.recording' has no attribute {name!r}")
-    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)

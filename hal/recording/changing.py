@@ -22,7 +22,7 @@ from .codecs import column_stats, exchange_flags, stats_as_lists
 from .dataset import Dataset
 from .finish import last_row, move_files, recover_all, write_table
 from .foreign import is_foreign
-from .index import merged_stats, read_stats, read_table
+from .index import column_values, make_column, merged_stats, read_stats, read_table
 from .layout import (
     MOVES,
     SUCCESS,
@@ -156,7 +156,6 @@ def _write_rows(
     new: Path, layout: DatasetLayout, file: int, first: Mapping[int, int], changes: Mapping[int, EpisodeChange]
 ) -> None:
     """Write a file of rows with the changed values; ``first`` has the place of each episode's first row in it."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     path = layout.data(file)
@@ -166,10 +165,7 @@ def _write_rows(
     owners = table["episode_index"].to_numpy()
     for key in dict.fromkeys(key for number in first for key in changes[number].columns):
         field = table.schema.field(key)
-        column = table[key].combine_chunks()
-        listed = pa.types.is_fixed_size_list(field.type)
-        flat = (column.flatten() if listed else column).to_numpy(zero_copy_only=False)
-        values = flat.reshape(len(table), -1).copy()
+        values = column_values(table[key]).copy()
         for number, begin in first.items():
             if key in changes[number].columns:
                 rows = changes[number].columns[key]
@@ -177,9 +173,7 @@ def _write_rows(
                     name = str(path.relative_to(layout.root))
                     raise DatasetError("has rows of another episode", file=name, episode=number)
                 values[begin : begin + len(rows)] = rows
-        array = pa.array(values.reshape(-1))
-        array = pa.FixedSizeListArray.from_arrays(array, values.shape[1]) if listed else array
-        table = table.set_column(table.schema.get_field_index(key), field, array.cast(field.type))
+        table = table.set_column(table.schema.get_field_index(key), field, make_column(values).cast(field.type))
     with pq.ParquetWriter(new, table.schema, write_page_checksum=True) as writer:
         begin = 0
         for size in sizes:

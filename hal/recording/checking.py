@@ -302,7 +302,8 @@ def check_compatible(
         )
     found = [*_settings(info, fps, robot_type), *_features(info["features"], features)]
     if last >= 0:
-        found += _depth(read_about(layout, last)["cameras"], cameras)
+        kept = {camera.name: {"streams": camera.more, "depth_unit_m": camera.depth_unit} for camera in cameras}
+        found += camera_differences(read_about(layout, last)["cameras"], kept)
     if found:
         raise CommandError(
             f"the dataset in {root} has another format: {'; '.join(found)}; choose a new folder", code="other_dataset"
@@ -350,20 +351,22 @@ def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:
     return f"the names of {key} differ: {'; '.join(parts) or 'their order is another'}"
 
 
-def _depth(old: Mapping[str, Any], new: Sequence[CameraSetup]) -> Iterator[str]:
-    """Yield differences in depth or other exact streams of the cameras in both, which no feature shows."""
-    for camera in new:
-        if camera.name not in old:
-            continue
-        for stream in (name for name in MORE_STREAMS if STREAMS[name].exact):
-            kept = stream in old[camera.name].get("streams", ()), stream in camera.more
-            if kept[0] != kept[1]:
-                where = "there, and not here" if kept[0] else "here, and not there"
-                yield f"{stream} of {camera.name} is kept {where}"
-        there, here = old[camera.name].get("depth_unit_m"), camera.depth_unit
+def camera_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    """Yield differences in the depth and the exact streams of cameras in both, which no feature shows.
+
+    The arguments are ``cameras`` of two episodes' metadata.
+    """
+    exact = [name for name in MORE_STREAMS if STREAMS[name].exact]
+    for camera in (name for name in new if name in old):
+        streams, ours = (each[camera].get("streams") or () for each in (old, new))
+        for stream in exact:
+            if (stream in streams) != (stream in ours):
+                where = "there, and not here" if stream in streams else "here, and not there"
+                yield f"{stream} of {camera} is kept {where}"
+        there, here = (each[camera].get("depth_unit_m") for each in (old, new))
         if there is None and here is not None:
-            yield f"depth of {camera.name} is not kept there, and is here"
+            yield f"depth of {camera} is not kept there, and is here"
         elif there is not None and here is None:
-            yield f"depth of {camera.name} is kept there, and not here"
+            yield f"depth of {camera} is kept there, and not here"
         elif there is not None and here is not None and not math.isclose(there, here, rel_tol=1e-6):
-            yield f"depth of {camera.name} is in units of {1e3 * there:g} mm there, and {1e3 * here:g} mm here"
+            yield f"depth of {camera} is in units of {1e3 * there:g} mm there, and {1e3 * here:g} mm here"

@@ -142,7 +142,6 @@ class DepthReader:
         return own
 
     def _decode(self, file: io.BufferedReader, k: int) -> Units:
-        """Return the picture that is stored in record ``k``."""
         import zstandard
 
         start, length = self._places[k].tolist()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import CommandError
 from .changing import existing_episodes
 from .dataset import Dataset, Episode, KeptRows
+from .index import column_values, make_column
 from .layout import (
     GRID,
     SETPOINT,
@@ -187,20 +188,14 @@ class _TrimmedEpisode(Episode):
             changed["next.done"] = count == self.length - 1
         for place, name in enumerate(table.column_names):
             if current_key(name).startswith(TIMES):
-                column = table[name].combine_chunks()
-                width = column.type.list_size if pa.types.is_fixed_size_list(column.type) else 1
-                values = (column.flatten() if width > 1 else column).to_numpy().reshape(-1, width).copy()
+                values = column_values(table[name]).copy()
                 values[:, 0] -= self._shift
-                flat = pa.array(values.reshape(-1))
-                table = table.set_column(
-                    place, name, flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
-                )
+                table = table.set_column(place, name, make_column(values))
             elif name in changed:
                 table = table.set_column(place, name, pa.array(changed[name]))
         return table
 
     def check_pictures(self) -> None:
-        """Check the pictures of the whole episode."""
         self._whole.check_pictures()
 
 

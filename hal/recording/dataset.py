@@ -156,7 +156,6 @@ class Episode:
 
     @cached_property
     def _about_file(self) -> Path:
-        """The file of the metadata."""
         return self._layout.about(self.number)
 
     def _is_current(self) -> bool:

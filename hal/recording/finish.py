@@ -22,7 +22,15 @@ from ..errors import DatasetError, HalError
 from .about import split_about
 from .codecs import Stats, column_stats, merge_stats, stats_as_lists
 from .dataset import Episode
-from .index import _TASK, check_next_episode, next_place, read_index, read_tasks
+from .index import (
+    _TASK,
+    check_next_episode,
+    column_values,
+    make_column,
+    next_place,
+    read_index,
+    read_tasks,
+)
 from .layout import (
     ACTION,
     CHUNK,
@@ -70,6 +78,12 @@ def new_info(features: Mapping[str, Any], fps: int, robot_type: str) -> dict[str
     }
 
 
+def totals(episodes: int, rows: int, tasks: int) -> dict[str, Any]:
+    """Return the entries of ``meta/info.json`` that count what a dataset has."""
+    counts = {"total_episodes": episodes, "total_frames": rows, "total_tasks": tasks}
+    return counts | {"splits": {"train": f"0:{episodes}"}}
+
+
 def rows_table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Any]) -> Any:
     """Return the Arrow table of an episode's rows, from columns (rows, n), in the order and types of ``features``."""
     import pyarrow as pa
@@ -78,9 +92,7 @@ def rows_table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Any])
     for key, feature in features.items():
         if feature["dtype"] == "video":
             continue
-        flat = pa.array(np.ascontiguousarray(columns[key].astype(feature["dtype"])).reshape(-1))
-        size = int(feature["shape"][0])
-        arrays[key] = flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+        arrays[key] = make_column(columns[key].astype(feature["dtype"]))
     return pa.table(arrays)
 
 
@@ -286,8 +298,11 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         tasks.append(about["task"])
     made: list[tuple[Path, Path]] = []
 
-    t_start = float(rest.rows[0, _place(about["columns"], GRID)])
-    columns = _columns(rest, t_start)
+    def put(name: str, target: Path) -> Path:
+        made.append((final / name, target))
+        return final / name
+
+    t_start, columns = _columns(rest)
     rows = len(rest.rows)
     closed = _about(rest, number, t_start, recovered)
     columns |= {
@@ -302,38 +317,28 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         "index": np.arange(start, start + rows)[:, None],
         "task_index": np.full((rows, 1), tasks.index(about["task"])),
     }
-    pq.write_table(rows_table(columns, info["features"]), final / "data.parquet", write_page_checksum=True)
-    made.append((final / "data.parquet", layout.data(place.data[0])))
+    data = put("data.parquet", layout.data(place.data[0]))
+    pq.write_table(rows_table(columns, info["features"]), data, write_page_checksum=True)
     stats: dict[str, Stats] = {key: column_stats(values) for key, values in columns.items()}
     for camera in rest.cameras:
         for name in camera.videos:
-            video = final / f"{name}.mp4"
+            video = put(f"{name}.mp4", layout.video(name, place.video(name)[0]))
             remux(rest.folder / video.name, video, rows)
             stats[video_key(name)] = picture_stats(video, rows, fps).stats()
-            made.append((video, layout.video(name, place.video(name)[0])))
         for name in camera.depths:
             made.append((rest.folder / f"{name}.depth", layout.depth(name, number)))
     place, entries = _continue_episode(layout, closed, place, start, fps, stats)
     own, name, common = split_about(closed | place.as_json())
     if not layout.common(name).exists():
-        write_json(final / "common.json", common)
-        made.append((final / "common.json", layout.common(name)))
-    write_json(final / "about.json", own, indent=None)
-    made.append((final / "about.json", layout.about(number)))
+        write_json(put("common.json", layout.common(name)), common)
+    write_json(put("about.json", layout.about(number)), own, indent=None)
 
-    write_table(final / "entry.parquet", entries)
-    made.append((final / "entry.parquet", layout.entry(place.entry)))
-    pq.write_table(tasks_table(tasks), final / "tasks.parquet")
-    made.append((final / "tasks.parquet", layout.tasks))
+    write_table(put("entry.parquet", layout.entry(place.entry)), entries)
+    pq.write_table(tasks_table(tasks), put("tasks.parquet", layout.tasks))
     before = read_json(layout.stats) if layout.stats.exists() else {}
-    write_json(
-        final / "stats.json",
-        stats_as_lists({key: merge_stats([*filter(None, [before.get(key)]), found]) for key, found in stats.items()}),
-    )
-    made.append((final / "stats.json", layout.stats))
-    total = {"total_episodes": number + 1, "total_frames": start + rows, "total_tasks": len(tasks)}
-    write_json(final / "info.json", info | total | {"splits": {"train": f"0:{number + 1}"}})
-    made.append((final / "info.json", layout.info))
+    whole = {key: merge_stats([*filter(None, [before.get(key)]), found]) for key, found in stats.items()}
+    write_json(put("stats.json", layout.stats), stats_as_lists(whole))
+    write_json(put("info.json", layout.info), info | totals(number + 1, start + rows, len(tasks)))
     for source, _ in made:
         sync_to_disk(source)
     sync_to_disk(final)
@@ -381,8 +386,8 @@ def interventions(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return found
 
 
-def _columns(rest: LiveContent, t_start: float) -> dict[str, NDArray[Any]]:
-    """Return the columns (rows, n) of a live folder, with times since the first row.
+def _columns(rest: LiveContent) -> tuple[float, dict[str, NDArray[Any]]]:
+    """Return the time of the first row of a live folder, s, and its columns (rows, n), with times since then.
 
     The action is the set-point one row later.
     """
@@ -391,19 +396,14 @@ def _columns(rest: LiveContent, t_start: float) -> dict[str, NDArray[Any]]:
     for key, _, names in rest.about["columns"]:
         columns[key] = rest.rows[:, place : place + len(names)]
         place += len(names)
+    t_start = float(columns[GRID][0, 0])
     for key, values in columns.items():
         if key.startswith(TIMES):
             values[:, 0] -= t_start
     setpoint = columns[SETPOINT]
     columns[ACTION] = np.concatenate([setpoint[1:], setpoint[-1:]])
     assert columns[ACTION].shape[1] == columns[STATE].shape[1]
-    return columns
-
-
-def _place(columns: list[list[Any]], key: str) -> int:
-    """Return the index of a column's first number in a row."""
-    keys = [column[0] for column in columns]
-    return sum(len(names) for _, _, names in columns[: keys.index(key)])
+    return t_start, columns
 
 
 def _about(rest: LiveContent, number: int, t_start: float, recovered: bool) -> dict[str, Any]:
@@ -427,7 +427,7 @@ def stats_of(episode: Episode) -> dict[str, Stats]:
     """Return the statistics of an episode's columns and videos, read again. Raises DatasetError for damaged files."""
     rows = episode.length
     table = episode.read_table()
-    stats = {key: column_stats(_numbers(table[key], rows)) for key in table.column_names}
+    stats = {key: column_stats(column_values(table[key])) for key in table.column_names}
     episode.check_pictures()
     for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
         if path.suffix == ".mp4":
@@ -435,10 +435,3 @@ def stats_of(episode: Episode) -> dict[str, Stats]:
                 first = episode.first_picture(path)
                 stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps, first).stats()
     return stats
-
-
-def _numbers(column: Any, rows: int) -> NDArray[Any]:
-    """Return a column of an Arrow table as an array (rows, n)."""
-    whole = column.combine_chunks()
-    found: NDArray[Any] = (whole.flatten() if hasattr(whole, "flatten") else whole).to_numpy(zero_copy_only=False)
-    return found.reshape(rows, -1)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import DatasetError
-from .index import read_tasks, validated_info
+from .index import read_entries, read_tasks, validated_info
 from .layout import CHUNK, GRID, MORE_STREAMS, DatasetLayout, current_key, read_json, video_key
 from .validation import dataset_errors
 
@@ -100,18 +100,14 @@ def _flat(names: Any) -> list[str]:
 
 def _entries(layout: DatasetLayout, info: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of ``meta/episodes``, without statistics, in the order of the episodes."""
-    import pyarrow.parquet as pq
-
-    found: list[dict[str, Any]] = []
+    found: dict[int, dict[str, Any]] = {}
     for path in sorted(layout.root.glob("meta/episodes/*/*.parquet")):
-        with dataset_errors(layout.root, path), pq.ParquetFile(path) as file:
-            wanted = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-            found += file.read(columns=wanted).to_pylist()
+        with dataset_errors(layout.root, path):
+            found |= read_entries(path)
     with dataset_errors(layout.root, layout.info):
-        found.sort(key=lambda entry: int(entry["episode_index"]))
-        if [entry["episode_index"] for entry in found] != list(range(info["total_episodes"])):
+        if sorted(found) != list(range(info["total_episodes"])):
             raise ValueError(f"it lists {info['total_episodes']} episodes, and meta/episodes has {len(found)}")
-    return found
+    return [found[number] for number in sorted(found)]
 
 
 def _places(

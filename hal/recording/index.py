@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -135,6 +136,21 @@ def read_table(path: Path) -> Any:
 
     with pq.ParquetFile(path) as file:
         return file.read(use_threads=False)
+
+
+def column_values(column: Any) -> NDArray[Any]:
+    """Return a column of an Arrow table as an array (rows, n)."""
+    whole = column.combine_chunks()
+    found: NDArray[Any] = (whole.flatten() if hasattr(whole, "flatten") else whole).to_numpy(zero_copy_only=False)
+    return found.reshape(len(whole), -1)
+
+
+def make_column(values: NDArray[Any]) -> Any:
+    """Return an array (rows, n) as an Arrow array: of numbers if n is 1, else of lists of n numbers."""
+    import pyarrow as pa
+
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+    return flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
 def read_stats(table: Any, keys: Collection[str] | None = None) -> dict[str, dict[str, NDArray[Any]]]:

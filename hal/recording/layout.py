@@ -519,6 +519,12 @@ def sync_to_disk(path: Path) -> None:
         os.close(fd)
 
 
+def count_bytes(path: Path) -> int:
+    """Return the size of a file, or of all files in a folder, bytes."""
+    files = [path] if path.is_file() else path.rglob("*")
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
@@ -529,17 +535,18 @@ def write_json(path: Path, data: Any, indent: int | None = 1) -> None:
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
     with beside.open("x", encoding="utf-8") as file:
-        file.write(json.dumps(_finite(data), indent=indent, default=str, allow_nan=False) + "\n")
+        file.write(json.dumps(make_finite(data), indent=indent, default=str, allow_nan=False) + "\n")
     sync_to_disk(beside)
     beside.replace(path)
     sync_to_disk(path.parent)
 
 
-def _finite(data: Any) -> Any:
+def make_finite(data: Any) -> Any:
+    """Return plain data, with None for numbers that are not finite."""
     if isinstance(data, float):
         return data if math.isfinite(data) else None
     if isinstance(data, dict):
-        return {key: _finite(value) for key, value in data.items()}
+        return {key: make_finite(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
-        return [_finite(value) for value in data]
+        return [make_finite(value) for value in data]
     return data

@@ -72,11 +72,6 @@ class RowQueue:
     # In the app.
 
     @property
-    def waiting(self) -> int:
-        """Number of rows that the writer has not released yet."""
-        return self._ring.waiting
-
-    @property
     def is_full(self) -> bool:
         """Whether there is no free slot."""
         return self._ring.is_full

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -168,7 +169,8 @@ class Recorder:
         """The current episode, or the last one."""
         self._is_open = False
         """Whether it is being recorded."""
-        self._saving: BackgroundSave | None = None
+        self._saver = ThreadPoolExecutor(1, "hal-recorder-save")
+        self._saving: Future[None] | None = None
         """Background saving of the last episode that was saved."""
         self._episode = -1
         self._closed = False
@@ -234,10 +236,8 @@ class Recorder:
                 raise CommandError("the recorder is closed", code="recorder_closed")
             if self._is_open:
                 raise CommandError(f"save or discard episode {self._episode} first", code="episode_open")
-            if self._saving is not None:
-                self._saving.wait()
-                if self._saving.error is not None:
-                    self.notes.append(str(self._saving.error))
+            if self._saving is not None and (error := self._saving.exception()) is not None:
+                self.notes.append(str(error))
             self._saving = None
             if self._child.process.poll() is not None:
                 self._child.close()
@@ -264,10 +264,10 @@ class Recorder:
     def status(self) -> RecorderStatus:
         """Return the current state. Never blocks."""
         episode, saving = self._current, self._saving
-        busy = saving is not None and not saving.done
+        busy = saving is not None and not saving.done()
         state = "saving" if busy else "recording" if self._is_open else "idle"
         free = self._queue.free_bytes or int(self._child.ready["free_bytes"])
-        failure = saving.error if saving is not None else None
+        failure = saving.exception() if saving is not None and not busy else None
         trouble = str(failure or (episode.trouble if episode is not None else ""))
         if not trouble and free < self._warn_free:
             trouble = f"only {free / 1e9:.1f} GB are free on the disk of {self.root}"
@@ -296,7 +296,7 @@ class Recorder:
         """
         with self._lock:
             episode, partial = self._end(), DatasetLayout(self.root).partial(self._episode)
-            saving = self._saving = BackgroundSave(lambda: self._save(episode, partial, success, result))
+            saving = self._saving = self._saver.submit(self._save, episode, partial, success, result)
         if wait:
             saving.result()
 
@@ -309,13 +309,17 @@ class Recorder:
     def _save(
         self, episode: EpisodeRecorder, partial: Path, success: bool | None, result: Mapping[str, Any] | None
     ) -> None:
-        if success is not None:
-            write_mark(partial, success)
-        episode.stop()
-        self._stop_cameras()
-        if self._child.request("save", {"closing": episode.final_metadata(success, result)}, _SAVING) is None:
-            why = episode.dropped.why or "it ended at once"
-            raise CommandError(f"no row was recorded, so there is nothing to save: {why}", code="no_rows")
+        try:
+            if success is not None:
+                write_mark(partial, success)
+            episode.stop()
+            self._stop_cameras()
+            if self._child.request("save", {"closing": episode.final_metadata(success, result)}, _SAVING) is None:
+                why = episode.dropped.why or "it ended at once"
+                raise CommandError(f"no row was recorded, so there is nothing to save: {why}", code="no_rows")
+        except Exception as error:
+            _LOG.warning("%s", error)
+            raise
 
     def discard(self) -> None:
         """End the episode and delete it. Raises CommandError if none is open (code ``no_episode``)."""
@@ -351,8 +355,7 @@ class Recorder:
             self._closed = True
             if self._is_open:
                 self.save()
-            if self._saving is not None:
-                self._saving.wait()
+            self._saver.shutdown()
             self._child.close()
             self._memory.close()
             pack_if_loose(self.root)
@@ -503,38 +506,6 @@ class DroppedRows:
     def as_json(self) -> list[dict[str, Any]]:
         """Return the gaps as the episode's file lists them."""
         return self._found
-
-
-class BackgroundSave:
-    """Runs ``work`` in a thread that the program waits for at its end; logs an error and keeps it."""
-
-    def __init__(self, work: Callable[[], None]) -> None:
-        self.error: Exception | None = None
-        self._work = work
-        self._thread = threading.Thread(target=self._run, name="hal-recorder-save")
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._work()
-        except Exception as error:
-            self.error = error
-            _LOG.warning("%s", error)
-
-    @property
-    def done(self) -> bool:
-        """Whether it has finished, successfully or not."""
-        return not self._thread.is_alive()
-
-    def wait(self) -> None:
-        """Block until it has finished."""
-        self._thread.join()
-
-    def result(self) -> None:
-        """Block until it has finished, and raise its error, if any."""
-        self.wait()
-        if self.error is not None:
-            raise self.error
 
 
 def check_rate(rig: Rig, fps: int) -> None:

@@ -19,6 +19,7 @@ from .finish import (
     recover_all,
     stats_of,
     tasks_table,
+    totals,
     write_table,
 )
 from .grasps import repair_grasps
@@ -143,8 +144,7 @@ def _rebuild_all(layout: DatasetLayout) -> int:
         raise DatasetError(f"the episodes have tasks of the numbers {sorted(tasks)}", file="data")
     write_table(layout.tasks, tasks_table([tasks[k] for k in sorted(tasks)]), keep_schema=True)
     write_json(layout.stats, stats_as_lists({key: merge_stats(found) for key, found in parts.items()}))
-    counts = {"total_episodes": count, "total_frames": start, "total_tasks": len(tasks)}
-    write_json(layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
+    write_json(layout.info, info | totals(count, start, len(tasks)))
     return count
 
 

@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from ..errors import DatasetError
 from ..types import Limited, RobotStatus, Trip
 from .dataset import Dataset, Episode
 from .exporters.content import ArmColumns, EpisodeContent, PictureStream
-from .layout import ACTION, SETPOINT, STATE
+from .layout import ACTION, SETPOINT, STATE, count_bytes, make_finite
 from .metadata import simulated_pace
 
 # Drawing.
@@ -171,7 +170,8 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
     """Read every row of these episodes, or of all, and return their statistics. Pictures are counted, not decoded."""
     lines: list[EpisodeSummary] = []
     broken: list[str] = []
-    states, actions = _Moments(), _Moments()
+    states: list[NDArray[Any]] = []
+    actions: list[NDArray[Any]] = []
     names: list[str] = []
     times: dict[str, _Times] = {}
     for episode in dataset.episodes if episodes is None else episodes:
@@ -184,8 +184,8 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
             continue
         lines.append(line)
         names = episode.names(STATE)
-        states.add(parts[0])
-        actions.add(parts[1])
+        states.append(parts[0])
+        actions.append(parts[1])
         for source, stamp in stamps.items():
             if source.startswith(_WATCHED):
                 times.setdefault(source, _Times()).add(stamp, stamps["grid"])
@@ -200,9 +200,9 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
         failures=sum(line.success is False for line in lines),
         unmarked=sum(line.success is None for line in lines),
         dropped=sum(line.dropped for line in lines),
-        bytes=_bytes(dataset.root),
-        state=states.spreads(names),
-        action=actions.spreads(names),
+        bytes=count_bytes(dataset.root),
+        state=_spreads(names, states),
+        action=_spreads(names, actions),
         timing=[found.timing(source) for source, found in times.items()],
         broken=broken,
     )
@@ -210,17 +210,7 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
 
 def summary_as_json(found: DatasetSummary) -> str:
     """Return a summary as one JSON object; unknown numbers are null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, float):
-            return value if math.isfinite(value) else None
-        if isinstance(value, dict):
-            return {key: plain(each) for key, each in value.items()}
-        if isinstance(value, list):
-            return [plain(each) for each in value]
-        return value
-
-    return json.dumps(plain(asdict(found)), indent=2)
+    return json.dumps(make_finite(asdict(found)), indent=2)
 
 
 def _line(episode: Episode) -> EpisodeSummary:
@@ -243,24 +233,10 @@ def _line(episode: Episode) -> EpisodeSummary:
     )
 
 
-def _bytes(folder: Path) -> int:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-
-
-class _Moments:
-    """Least, greatest, mean and standard deviation of columns that are added in parts, without unknown values (NaN)."""
-
-    def __init__(self) -> None:
-        self._parts: list[NDArray[np.float64]] = []
-
-    def add(self, values: NDArray[Any]) -> None:
-        self._parts.append(np.asarray(values, np.float64))
-
-    def spreads(self, names: list[str]) -> list[ColumnSpread]:
-        if not self._parts:
-            return []
-        table = np.concatenate(self._parts)
-        return [ColumnSpread(name, *_of(table[:, k])) for k, name in enumerate(names)]
+def _spreads(names: list[str], parts: Sequence[NDArray[Any]]) -> list[ColumnSpread]:
+    """Return the statistics of columns in parts, without unknown values (NaN)."""
+    table = np.concatenate(parts, dtype=np.float64) if parts else np.zeros((0, 0))
+    return [ColumnSpread(name, *_of(table[:, k])) for k, name in enumerate(names)]
 
 
 def _of(values: NDArray[np.float64]) -> Iterator[float]:
@@ -484,8 +460,10 @@ def _panel(canvas: SheetCanvas, content: EpisodeContent, curve: _Curve, left: fl
         canvas.line([(x, top), (x, top + _PANEL)], LIGHT)
         canvas.text(x, top + _PANEL + 3, f"{tick:g} s", 11, GREY, "ma")
     for values, colour, thick in ((curve.commanded, _COMMANDED, 3.0), (curve.measured, _MEASURED, 1.4)):
-        for part in _find_runs(values):
-            canvas.line([at(float(content.grid[k]), float(values[k])) for k in part], colour, thick)
+        edges = np.flatnonzero(np.diff(np.isfinite(values), prepend=False, append=False))
+        for start, end in edges.reshape(-1, 2):  # a run of rows that hold a number
+            points = zip(content.grid[start:end].tolist(), values[start:end].tolist(), strict=True)
+            canvas.line([at(t, value) for t, value in points], colour, thick)
 
 
 def _range(curve: _Curve) -> tuple[float, float]:
@@ -494,16 +472,3 @@ def _range(curve: _Curve) -> tuple[float, float]:
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     middle, half = (low + high) / 2, max(high - low, curve.least) * 0.55
     return middle - half, middle + half
-
-
-def _find_runs(values: NDArray[np.float64]) -> Iterator[list[int]]:
-    """Yield runs of rows that hold a number."""
-    part: list[int] = []
-    for k, known in enumerate(np.isfinite(values).tolist()):
-        if known:
-            part.append(k)
-        elif part:
-            yield part
-            part = []
-    if part:
-        yield part

@@ -50,9 +50,9 @@ class SampleClock(ABC):
     def end(self) -> None:
         """Stop reading: no further due times. Rows that are due are still made. Idempotent."""
 
-    @abstractmethod
     def stop(self) -> None:
         """Stop reading, and block until all rows are made."""
+        self.end()
 
 
 class RealTimeSampleClock(SampleClock):
@@ -85,7 +85,6 @@ class RealTimeSampleClock(SampleClock):
         return self.start_time + self._number * self._period
 
     def _notice(self) -> None:
-        """Read a snapshot if a row is due."""
         with self._reading:
             now = self._clock.now()
             if self._ending.is_set() or self._due() > now:
@@ -134,9 +133,6 @@ class LockStepSampleClock(SampleClock):
         self._detach()
         with self._making:  # wait for a row in progress
             pass
-
-    def stop(self) -> None:
-        self.end()
 
     def _make_row(self) -> None:
         with self._making:

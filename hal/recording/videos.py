@@ -9,9 +9,9 @@ import os
 import struct
 import sys
 import threading
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -277,7 +277,10 @@ class _RgbConverter:
 
 
 class _OpenVideo:
-    """A video that stays open, for pictures in any order."""
+    """A video that stays open, for pictures in any order: opening it takes longer than decoding one.
+
+    Its place in the file is its own: each thread of each process needs one.
+    """
 
     def __init__(self, path: Path) -> None:
         import av
@@ -300,40 +303,11 @@ class _OpenVideo:
         return None
 
 
-class _OpenVideos:
-    """Keeps the videos open that were read last, each for the thread that reads it.
-
-    Opening one takes longer than decoding a picture: its index has every picture of the file.
-    """
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._clear()
-        os.register_at_fork(after_in_child=self._clear)
-
-    def _clear(self) -> None:
-        """Forget all videos; a forked process shares their positions with its parent, and must not close them."""
-        self._inherited = getattr(self, "_videos", None)
-        self._videos: OrderedDict[Any, _OpenVideo] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, path: Path) -> _OpenVideo:
-        key = threading.get_ident(), path, file_version(path)
-        with self._lock:
-            if (known := self._videos.get(key)) is not None:
-                self._videos.move_to_end(key)
-                return known
-        opened = _OpenVideo(path)
-        with self._lock:
-            self._videos[key] = opened
-            while len(self._videos) > self._most:
-                self._videos.popitem(last=False)
-        return opened
-
-
-_OPEN = _OpenVideos(32)
+@lru_cache(maxsize=32)
+def _open_video(path: Path, version: tuple[int, int] | None, process: int, thread: int) -> _OpenVideo:
+    return _OpenVideo(path)
 
 
 def read_picture(path: Path, number: int, fps: int) -> Picture | None:
     """Return one picture (H, W, 3) RGB of a video; None if there are not so many. The file stays open for others."""
-    return _OPEN.get(path).picture(number, fps)
+    return _open_video(path, file_version(path), os.getpid(), threading.get_ident()).picture(number, fps)

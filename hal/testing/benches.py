@@ -251,12 +251,12 @@ class Contract:
 # Waiting.
 
 
-def wait_lost(bench: Bench, use: Callable[[], object]) -> ConnectionLost:
+def wait_lost(bench: Bench, use: Callable[[], object], slack: float = 0.0) -> ConnectionLost:
     """Call ``use`` until it raises ConnectionLost, at most for the bench's patience, and return the error.
 
-    Fails for any other error.
+    Fails for any other error. On a busy machine it may take ``slack`` s longer.
     """
-    deadline = time.monotonic() + bench.patience
+    deadline = time.monotonic() + bench.patience + slack
     while True:
         try:
             use()
@@ -271,9 +271,9 @@ def wait_lost(bench: Bench, use: Callable[[], object]) -> ConnectionLost:
             pytest.fail(f"the link is lost, and the driver does not raise ConnectionLost within {bench.patience:g} s")
 
 
-def wait_restored(bench: Bench, use: Callable[[], _T]) -> _T:
+def wait_restored(bench: Bench, use: Callable[[], _T], slack: float = 0.0) -> _T:
     """Call ``use`` until it raises no HalError, at most for the bench's patience, and return its result."""
-    deadline = time.monotonic() + bench.patience
+    deadline = time.monotonic() + bench.patience + slack
     while True:
         try:
             return use()

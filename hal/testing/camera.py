@@ -37,7 +37,6 @@ def _images(frame: RawFrame) -> dict[str, np.ndarray]:
 
 
 def _grab(bench: CameraBench) -> RawFrame:
-    """Return the next frame of the driver."""
     deadline = time.monotonic() + _FIRST
     while True:
         if not bench.real_time:
@@ -68,33 +67,9 @@ class _ListeningCamera:
         self.camera.on_connection(self.news.append)
 
     def read(self, limit: float = _READ) -> Frame:
-        """Return the next frame."""
         if not self.bench.real_time:
             self.bench.pass_time()
         return self.camera.read(limit)
-
-    def wait_lost(self) -> ConnectionLost:
-        """Read until the camera is lost, and return the error."""
-        deadline = time.monotonic() + self.bench.patience + _SLACK
-        while time.monotonic() < deadline:
-            try:
-                self.read(_APP_WAIT)
-            except ConnectionLost as error:
-                return error
-            except StaleStateError:
-                continue
-        raise AssertionError("the link is lost, and read() does not raise ConnectionLost")
-
-    def wait_back(self) -> Frame:
-        """Read until the camera works again, and return the frame."""
-        deadline = time.monotonic() + self.bench.patience + _READ
-        while True:
-            try:
-                return self.read(_APP_WAIT)
-            except HalError as error:
-                if time.monotonic() > deadline:
-                    raise AssertionError(f"the link is restored, and read() still raises: {error}") from error
-                time.sleep(0.02)
 
     def wait_news(self, times: int) -> ConnectionLost | None:
         """Wait for a call of the callback, which may be a moment after ``read`` raised, and return its argument."""
@@ -325,7 +300,7 @@ class CameraContract(Contract):
     def test_an_app_notices_a_lost_camera(self, bench: CameraBench, app: _ListeningCamera) -> None:
         app.read()
         bench.lose()
-        error = app.wait_lost()
+        error = wait_lost(bench, lambda: app.read(_APP_WAIT), _SLACK)
         assert str(error)
         assert not app.camera.connected
         with pytest.raises(ConnectionLost):
@@ -336,9 +311,9 @@ class CameraContract(Contract):
     def test_an_app_reads_again_after_the_camera_is_restored(self, bench: CameraBench, app: _ListeningCamera) -> None:
         before = app.read()
         bench.lose()
-        app.wait_lost()
+        wait_lost(bench, lambda: app.read(_APP_WAIT), _SLACK)
         bench.restore()
-        after = app.wait_back()
+        after = wait_restored(bench, lambda: app.read(_APP_WAIT), _READ)
         assert after.stamp.seq > before.stamp.seq, "seq continues"
         assert after.stamp.t > before.stamp.t
         assert app.camera.connected

@@ -26,7 +26,6 @@ _SLACK = 2.0
 
 
 def _poll(bench: PadBench) -> PadReading:
-    """Poll once without waiting."""
     return bench.driver.poll(bench.pass_time(), 0.0)
 
 

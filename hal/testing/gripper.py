@@ -46,12 +46,10 @@ def _run_until_rest(bench: GripperBench) -> list[GripperReading]:
 
 
 def _half(bench: GripperBench) -> float:
-    """Return half the opening, m."""
     return bench.driver.spec.width_max / 2
 
 
 def _open_driver(bench: GripperBench) -> GripperBench:
-    """Open the driver, and read once."""
     bench.driver.open()
     bench.driver.read(bench.pass_time())
     return bench

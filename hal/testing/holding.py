@@ -137,7 +137,6 @@ class _Hand:
         return HoldResult(verdicts.count(False), error, slip, turn, strength, shaken)
 
     def _add(self) -> None:
-        """Add the object at the tcp."""
         middle, half = self.base @ self.arm.state().tcp, self.width / 2.0
         place = (tuple(middle.position.tolist()), tuple(middle.orientation.tolist()))
         if self.thing == "cylinder":
@@ -147,7 +146,6 @@ class _Hand:
         self.rig.world.add(body)
 
     def _in_hand(self) -> Pose:
-        """Return the pose of the object in the frame of the tcp."""
         return (self.base @ self.arm.state().tcp).inverse() @ self.rig.world.pose(self.thing)
 
     def _shake(self, seen: list[Pose]) -> float:

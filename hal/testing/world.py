@@ -29,7 +29,6 @@ _PROPERTIES = (
 
 
 def _steps(world: WorldDriver, seconds: float) -> WorldDriver:
-    """Advance a world, and return it."""
     for _ in range(round(seconds / world.dt)):
         world.step()
     return world

@@ -154,11 +154,6 @@ def test_the_page_says_one_thing_to_do_and_it_works(bench: Bench, moving: Browse
     wait_for(lambda: moving.text("#hold b") == "HELD" and not moving.text("#trip-text"), "nothing more to do")
 
 
-def test_the_stop_button(bench: Bench, moving: Browser) -> None:
-    stops_for(bench, moving, "stop", lambda: moving.click("#stop"))
-    goes_on_after_release_and_press(bench, moving)
-
-
 def test_a_closed_tab(bench: Bench, moving: Browser) -> None:
     console = moving.chrome.current_window_handle
     moving.chrome.switch_to.new_window("window")

@@ -1,4 +1,4 @@
-"""Bench of a UR5e: the unmodified driver and ur_rtde against an emulator."""
+"""Bench of a UR: the unmodified driver and ur_rtde against an emulator."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hal.testing import RobotBench
 from ..wire.ur_kit import UrEmulator
 from .apart import Apart
 
-__all__ = ["UR5e"]
+__all__ = ["Ur"]
 
 
-class UR5e:
+class Ur:
     """An emulated arm that serves many checks, each as after switching on."""
 
-    def __init__(self) -> None:
-        self.emulator = UrEmulator()
+    def __init__(self, robot: str) -> None:
+        self.emulator = UrEmulator(robot=robot)
         # A quarter of the controller's rate: three calls to another process in each cycle take their time.
         self.spec = replace(load(self.emulator.rig()).resolve().robots[0], rate_hz=125.0)
 

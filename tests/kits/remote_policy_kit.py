@@ -44,11 +44,12 @@ def run(
     seconds: float = 3.0,
     timeout: float = 5.0,
     metadata: dict[str, Any] | None = None,
+    reset: Callable[[dict[str, Any]], None] | None = None,
     rehearse: bool = False,
     on_turn: Callable[[float], None] = lambda seconds: None,
 ) -> PolicyOutcome:
     """Run an episode of a policy on a server of its own."""
-    with PolicyServer(infer, metadata=metadata) as server:
+    with PolicyServer(infer, reset=reset, metadata=metadata) as server:
         policy = RemotePolicy(
             rig, PolicyClient(server.url, timeout=timeout), load_policy_config(config), task="wave", latency=latency
         )

@@ -25,7 +25,7 @@ from hal.driver import GripperReading
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
-from hal.drivers.can.damiao_protocol import CLEAR_ERROR, ENABLE, MOTOR_RANGES, MotorStatus
+from hal.drivers.can.damiao_protocol import CLEAR_ERROR, MOTOR_RANGES, MotorStatus
 from hal.errors import ConfigError, DeviceNotFound, HalError, MotionStopped, RobotFault
 from hal.host.cycle import Cycle
 from hal.host.records import AppRecord, GroupMemory
@@ -566,17 +566,6 @@ def test_no_joint_pushes_on_after_the_fault_of_another_one(line: str) -> None:
         assert fastest(arm, 0.5, range(5)) <= 0.1
 
 
-def test_recover_lets_go_of_no_motor_that_carries_the_arm() -> None:
-    """Motors that heard nothing for longer than their TIMEOUT damp; switched off, they would let the arm fall."""
-    with driven() as arm:
-        starve(arm)
-        arm.run(0.1)
-        sinking = fastest(arm, 0.3)
-        arm.robot.recover()
-        assert fastest(arm, 0.6) <= max(0.5, 1.1 * sinking)
-        assert {motor.status for motor in arm.driver.chain.motors} == {MotorStatus.LOST_COMMUNICATION}
-
-
 def test_a_motor_that_was_switched_on_is_not_cleared_because_its_answers_are_late() -> None:
     with driven() as arm:
         starve(arm)
@@ -598,27 +587,6 @@ def test_a_motor_that_was_switched_on_is_not_cleared_because_its_answers_are_lat
         assert arm.run(0.6, STILL) is None
         assert arm.driver.engaged
         assert cleared == [MotorStatus.LOST_COMMUNICATION]
-
-
-@pytest.mark.parametrize("number", [2, 3, 5])
-def test_a_motor_that_does_not_switch_on_leaves_the_others_holding(number: int) -> None:
-    """Its own joint falls, with the fault; the others bear the jolt."""
-    with driven() as arm:
-        motor, at = arm.far.arm.motors[number], arm.q
-        others = [k for k in range(6) if k != number - 1]
-        command = motor.command
-        motor.command = lambda data: None if data == ENABLE else command(data)
-        arm.far.execute(f"status {number} B")
-        arm.run(0.2)
-        arm.robot.recover()
-        arm.run(0.1)
-        arm.control.rearm()
-        with pytest.raises(MotionStopped):
-            raise arm.run(2.0, STILL) or AssertionError("it was switched on")
-        arm.run(1.5)
-        assert fastest(arm, 1.0, others) <= 0.5
-        assert np.abs(arm.q - at)[others].max() < 0.1
-        assert [motor.on for motor in arm.driver.chain.motors] == [k != number for k in range(1, 7)]
 
 
 @pytest.mark.parametrize("line", ["", "status 0 7", "status 4 10", "cut 0.3"])

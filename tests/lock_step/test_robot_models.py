@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -49,6 +51,19 @@ def test_a_model_drives_closes_its_gripper_and_stays_where_a_reset_put_it(
             assert found.widths[0] - found.width_min > 0.02
         if rig.robots["arm"].limits.torque is not None:
             check_that_it_stays(rig)
+
+
+def test_a_hand_whose_fingers_are_cut_into_slices_needs_no_scipy() -> None:
+    """trimesh asks for it where it makes a hull; the extra ``robots`` does not bring it."""
+    pytest.importorskip("mujoco")
+    code = (
+        "import sys; sys.modules['scipy'] = None; import hal\n"
+        "rig = {'sim': True, 'robots': {'arm': {'model': 'so101'}}}\n"
+        "try: hal.open(rig, engine='mujoco', clock='lock_step').close()\n"
+        "except hal.ConfigError as error: print(error.problems[0].code)\n"
+    )
+    said = subprocess.run([sys.executable, "-c", code], check=True, timeout=120.0, stdout=subprocess.PIPE, text=True)
+    assert said.stdout.strip() in ("", "missing_package")
 
 
 def check_that_it_stays(rig: hal.Rig) -> None:

@@ -295,73 +295,7 @@ def setters(host: str) -> Report:
     return {**report, **tool, "m_load": state.m_load}
 
 
-def refused(host: str) -> Report:
-    """Try a connection that is refused."""
-    return {"error": attempt(lambda: connect(host))}
-
-
-def truncated(host: str) -> Report:
-    robot = connect(host)
-    with EmulatorControl(host) as control:
-        control.send("truncate on")
-        texts = [attempt(robot.read_once) for _ in range(20)]
-    return {"error": next((text for text in texts if text), "")}
-
-
 # Scenarios with pylibfranka only.
-
-
-def smooth(host: str, share: float, anchored: bool, jerk: float, duration: float = 3.0) -> Report:
-    """Go back and forth within limits while commands get lost; anchored: continue from what the robot took."""
-    import ruckig
-
-    robot = connect(host)
-    online = ruckig.Ruckig(7, 0.001)
-    given, made = ruckig.InputParameter(7), ruckig.OutputParameter(7)
-    given.max_velocity, given.max_acceleration, given.max_jerk = [1.0] * 7, [6.0] * 7, [jerk] * 7
-    control = robot.start_joint_position_control(IMPEDANCE)
-    state, _ = control.readOnce()
-    home = list(state.q_d)
-    given.current_position, given.current_velocity, given.current_acceleration = home, [0.0] * 7, [0.0] * 7
-    anchors = cycles = 0
-
-    def drive() -> None:
-        nonlocal anchors, cycles
-        while True:
-            side = 0.2 if cycles // 300 % 2 == 0 and cycles < 1000 * duration else 0.0
-            given.target_position = [home[0] + side, *home[1:]]
-            outcome = online.update(given, made)
-            made.pass_to_input(given)
-            sent = list(made.new_position)
-            command = franka.JointPositions(sent)
-            command.motion_finished = cycles >= 1000 * duration and outcome == ruckig.Result.Finished
-            control.writeOnce(command)
-            if command.motion_finished:
-                return
-            state, _ = control.readOnce()
-            cycles += 1
-            if anchored and max(abs(a - b) for a, b in zip(state.q_d, sent, strict=True)) > 4e-7:
-                anchors += 1
-                given.current_position, given.current_velocity = list(state.q_d), list(state.dq_d)
-                given.current_acceleration = [max(-6.0, min(6.0, value)) for value in state.ddq_d]
-
-    with EmulatorControl(host) as faults:
-        faults.send("lose-commands", share)
-    return {"error": attempt(drive), "cycles": cycles, "anchors": anchors, **after(robot)}
-
-
-def stops(host: str, button: str) -> Report:
-    """Press a stop in a motion; what is possible while it is pressed, and after."""
-    robot = connect(host)
-    with EmulatorControl(host) as control:
-        first = move(robot, disturb=lambda values: control.send(button, "on"))
-        told = after(robot)
-        refused = move(robot)["error"]
-        recovery = attempt(robot.automatic_error_recovery)
-        control.send(button, "off")
-    wait_mode(robot, "Idle")
-    again = {**move(robot), **after(robot)}
-    return {"first": first["error"], "told": told, "refused": refused, "recovery": recovery, **again}
 
 
 def cartesian(host: str) -> Report:
@@ -387,47 +321,6 @@ def asynchronous(host: str) -> Report:
     made.handler.stop_control()
     wait_mode(robot, "Idle")
     return {"errors": [text for text in errors if text], "goal": goal, **after(robot)}
-
-
-def second(host: str) -> Report:
-    """Connect a second client, while one is connected, and afterwards."""
-    robot = connect(host)
-    text = attempt(lambda: connect(host))
-    still = after(robot)["mode"]
-    del robot
-    return {"error": text, "first": still, "then": attempt(lambda: connect(host).read_once())}
-
-
-def comeback(host: str, away: float) -> Report:
-    """Restart the robot in a motion; the old object is dead, a new one works."""
-    robot = connect(host)
-    with EmulatorControl(host) as control:
-        first = move(robot, duration=2.0, disturb=lambda values: control.send("restart", away))
-    dead = attempt(robot.read_once)
-    for _ in range(100):
-        if not attempt(lambda: connect(host)):
-            break
-        time.sleep(0.05)
-    fresh = connect(host)
-    return {"first": first["error"], "dead": dead, **move(fresh), **after(fresh)}
-
-
-def unanswered(host: str) -> Report:
-    """Wait for an end of the motion that the robot never reports: the library waits for ever."""
-    robot = connect(host)
-    with EmulatorControl(host) as control:
-        control.send("no-move-reply on")
-    return move(robot, duration=0.05, at=1.0)
-
-
-def slow(host: str, seconds: float) -> Report:
-    """Measure how long a setter takes."""
-    robot = connect(host)
-    with EmulatorControl(host) as control:
-        control.send("slow-reply", seconds)
-    began = time.monotonic()
-    robot.set_joint_impedance([3000.0] * 7)
-    return {"seconds": time.monotonic() - began}
 
 
 if __name__ == "__main__":

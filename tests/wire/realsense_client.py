@@ -25,16 +25,13 @@ class Picture(NamedTuple):
     """One frame of a set, copied."""
 
     number: int
-    stamp: float
-    """s"""
-    domain: str
     pixels: np.ndarray
 
 
 class Client:
     """A pipeline on a camera. The context must outlive it."""
 
-    def __init__(self, context: Any, serial: str, *streams: str, color: str = "rgb8", **mode: int) -> None:
+    def __init__(self, context: Any, serial: str, *streams: str, **mode: int) -> None:
         self.pipeline = rs.pipeline(context)
         config = rs.config()
         config.enable_device(serial)
@@ -42,7 +39,7 @@ class Client:
         size, rate = (mode.get("width", 640), mode.get("height", 480)), mode.get("rate", 30)
         for name in self.streams:
             kind, index = STREAMS[name]
-            format = {"depth": "z16", "color": color}.get(name, "y8")
+            format = {"depth": "z16", "color": "rgb8"}.get(name, "y8")
             config.enable_stream(getattr(rs.stream, kind), index, *size, getattr(rs.format, format), rate)
         self.profile = self.pipeline.start(config)
 
@@ -63,13 +60,6 @@ class Client:
                 return found
         raise AssertionError("30 sets and none that belongs together")
 
-    def silent(self, seconds: float) -> bool:
-        """Return whether nothing new arrives for that long, apart from what was on its way."""
-        while self.pipeline.poll_for_frames():
-            pass
-        arrived, _ = self.pipeline.try_wait_for_frames(round(1e3 * seconds))
-        return not arrived
-
     def stop(self) -> None:
         self.pipeline.stop()
 
@@ -81,21 +71,17 @@ def pictures(frames: Any, streams: tuple[str, ...]) -> dict[str, Picture]:
         kind = (frame.profile.stream_type().name, frame.profile.stream_index())
         name = next(name for name, known in STREAMS.items() if known == kind)
         if name in streams:
-            domain = frame.get_frame_timestamp_domain().name
-            pixels = np.asanyarray(frame.get_data()).copy()
-            found[name] = Picture(frame.get_frame_number(), frame.get_timestamp() / 1e3, domain, pixels)
+            found[name] = Picture(frame.get_frame_number(), np.asanyarray(frame.get_data()).copy())
     return found
 
 
-def played(
-    path: Path, *, paced: bool = False, streams: tuple[str, ...] = ("depth", "color", "infrared")
-) -> Iterator[dict[str, Picture]]:
+def played(path: Path, streams: tuple[str, ...] = ("depth", "color", "infrared")) -> Iterator[dict[str, Picture]]:
     """Play a recording to its end; the first one or two sets may come before their last stream is started."""
     context = rs.context()
     device = context.load_device(str(path))
     pipeline = rs.pipeline(context)
     pipeline.set_device(device)  # with the file's name it would open the file again, without this:
-    device.set_real_time(paced)
+    device.set_real_time(False)
     pipeline.start(rs.config())
     try:
         while True:
@@ -107,29 +93,16 @@ def played(
         pipeline.stop()
 
 
-def listed(context: Any) -> list[str]:
-    """Return the serial numbers of the connected cameras."""
-    return [device.get_info(rs.camera_info.serial_number) for device in context.query_devices()]
-
-
 class Bench:
-    """A camera in a context, and the announcements of the context."""
+    """A camera in a context of its own."""
 
-    def __init__(self, spec: CameraSpec = VGA, context: Any = None, **options: Any) -> None:
-        self.context = context if context is not None else emulated_context()
+    def __init__(self, spec: CameraSpec = VGA, **options: Any) -> None:
+        self.context = emulated_context()
         self._clients: list[Client] = []
-        self.announced: list[tuple[list[str], list[bool]]] = []
-        """(serials that came, whether each watched device went)"""
-        self.watched: list[Any] = []
-        self.context.set_devices_changed_callback(self._note)
         self.camera = SoftwareCamera(spec, **options)
         self.camera.attach(self.context)
 
-    def _note(self, change: Any) -> None:
-        came = [device.get_info(rs.camera_info.serial_number) for device in change.get_new_devices()]
-        self.announced.append((came, [change.was_removed(device) for device in self.watched]))
-
-    def client(self, *streams: str, **options: Any) -> Client:
+    def client(self, *streams: str, **options: int) -> Client:
         """Start a pipeline on this camera."""
         self._clients.append(Client(self.context, self.camera.serial, *streams, **options))
         return self._clients[-1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable
 
 import can
@@ -11,7 +10,6 @@ import pytest
 from can_kit import can_overrides, emulated_arm
 
 from hal.config import load
-from hal.drivers.can import interfaces
 from hal.drivers.can.preflight import check_damiao, check_piper
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
@@ -97,21 +95,6 @@ def test_a_bus_at_another_bit_rate_shows_error_frames(monkeypatch: pytest.Monkey
     failed = wrong(results(absent("yam")))
     assert "another bit rate" in failed[0].found
     assert "bit rate" in failed[0].remedy
-
-
-def test_the_first_lines_of_five_mistakes_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    firsts = []
-    real = load("yam", sim=False, overrides=["cameras={}"]).resolve().robots[0]
-    link = {"ifname": "can0", "link_type": "can", "linkinfo": {"info_data": {"bittiming": {"bitrate": 500_000}}}}
-    for one in ({**link, "flags": []}, {**link, "flags": ["UP"]}):
-        monkeypatch.setattr(interfaces, "_run_ip", lambda one=one: json.dumps([one]))
-        firsts.append(results(real)[0])
-    firsts.append(wrong(results(absent("yam")))[0])
-    for command in ("silent 4 on", "register 2 VMAX 8"):
-        with emulated_arm("yam") as far:
-            far.execute(command)
-            firsts.append(wrong(results(far.spec))[0])
-    assert len({result.found for result in firsts}) == len({result.remedy for result in firsts}) == 5
 
 
 def test_limits_that_were_lost_in_the_arm_fail() -> None:

@@ -137,16 +137,6 @@ def test_an_impossible_move_is_an_invalid_argument() -> None:
     assert bench.arm.motion is None
 
 
-def test_a_client_that_is_gone_leaves_an_arm_that_stops() -> None:
-    bench = Bench()
-    bench.move(Generator.JOINT_VELOCITY)
-    bench.speed_up()
-    bench.arm.client_gone()
-    bench.idle(60)
-    assert bench.arm.at_rest
-    assert bench.journal.events()[-1]["outcome"] == "aborted"
-
-
 def test_modes_in_the_state() -> None:
     bench = Bench()
     assert (bench.state("motion_generator_mode"), bench.state("controller_mode"), bench.state("robot_mode")) == (

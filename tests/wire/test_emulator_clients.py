@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable
 from typing import Any
 
@@ -114,17 +113,6 @@ def test_setters_are_checked_and_remembered(client, emulator, robot):
 
 
 @both
-@pytest.mark.parametrize("flag", ["joint_reflex", "cartesian_reflex"])
-def test_a_reflex_stops_refuses_and_is_recovered_from(client, flag):
-    report = client("recovery", flag=flag)
-    assert f'["{flag}"]' in report["first"]
-    assert report["told"]["mode"] == "Reflex"
-    assert report["told"]["errors"] == report["told"]["last_errors"] == [flag]
-    assert "not possible in the current mode" in report["refused"]
-    assert (report["recovered"], report["error"], report["errors"]) == ("", "", [])
-
-
-@both
 def test_every_flag_has_the_name_that_the_library_gives_it(client, robot):
     known = 41 if robot == "fr3" else 37
     names = client("all_flags")["names"]
@@ -141,46 +129,9 @@ def test_an_arm_beyond_its_range_has_to_be_guided_by_hand(client, emulator):
     assert emulator.control.send("state")["mode"] == "idle"
 
 
-@pytest.mark.parametrize(("button", "mode"), [("user-stop", "UserStopped"), ("emergency-stop", "Other")])
-def test_a_stop_that_is_pressed(client, button, mode):
-    report = client("stops", button=button)
-    assert "User Stop pressed" in report["first"]
-    assert report["told"]["mode"] == mode
-    assert "not possible in the current mode" in report["refused"]
-    assert report["recovery"] != ""
-    assert report["error"] == "", "it was released"
-
-
-@both
-def test_a_step_of_50_mrad_is_stopped(client, emulator, robot):
-    report = client("jump")
-    assert '["joint_motion_generator_velocity_limits_violation"]' in report["error"]
-    assert report["mode"] == "Reflex"
-    assert report["q"][0] - HOME[0] < 0.06, "the step was not made"
-    assert f"limit {2.62 if robot == 'fr3' else 2.175} rad/s" in emulator.events("reflex")[-1]["text"]
-
-
 def test_a_start_from_elsewhere_is_stopped(client):
     report = client("jump", by=0.02, at=0.0)
     assert '["joint_position_motion_generator_start_pose_invalid"]' in report["error"]
-
-
-@both
-@pytest.mark.parametrize(
-    ("command", "text"),
-    [
-        ("silence 0.3", "communication_constraints_violation"),
-        ("silence 1.5", "UDP receive: Timeout"),
-        ("lose-commands 1", "communication_constraints_violation"),
-        ("lose-commands next 20", "communication_constraints_violation"),
-        ("user-stop on", "User Stop pressed"),
-        ("emergency-stop on", "User Stop pressed"),
-    ],
-)
-def test_faults_that_end_a_motion(client, command, text):
-    report = client("motion", commands=[command])
-    assert text in report["error"]
-    assert not command.startswith("silence") or report["wall"] >= 0.3
 
 
 def test_nineteen_lost_commands_in_a_row_end_no_motion(client, emulator):
@@ -192,40 +143,6 @@ def test_lost_states_lower_the_success_rate_and_end_no_motion(client, emulator):
     assert client("motion", commands=["lose-states 0.2"], way=0.02)["error"] == ""
     assert 0.6 < emulator.events("motion ended")[-1]["success_rate"] < 0.95
     assert emulator.control.send("stats")["states_lost"] > 20
-
-
-def test_five_percent_of_lost_commands_end_a_motion_that_is_not_anchored_to_what_the_robot_took(client, emulator):
-    assert "acceleration_discontinuity" in client("smooth", share=0.05, anchored=False, jerk=1500.0)["error"]
-    emulator.refresh()
-    report = client("smooth", share=0.05, anchored=True, jerk=1500.0)
-    assert (report["error"], report["mode"]) == ("", "Idle")
-    assert report["anchors"] > 0
-    assert emulator.control.send("stats")["lost"] > 100
-
-
-@both
-def test_states_that_are_too_short(client):
-    assert "incorrect object size" in client("truncated")["error"]
-
-
-@both
-def test_another_version_is_refused(client, emulator):
-    emulator.control.send("version 9")
-    assert "version: 9" in client("refused")["error"].replace("version 9", "version: 9")
-
-
-def test_a_second_client_is_refused_and_the_first_is_not_disturbed(client, emulator):
-    report = client("second")
-    assert "interrupted" in report["error"]
-    assert (report["first"], report["then"]) == ("Idle", "")
-    assert emulator.events("second client")
-
-
-def test_a_new_connection_after_a_restart(client):
-    report = client("comeback", away=0.2)
-    assert "closed connection" in report["first"] or "Timeout" in report["first"]
-    assert report["dead"] != ""
-    assert (report["error"], report["mode"]) == ("", "Idle")
 
 
 def test_cartesian_motions_are_refused(client, emulator):
@@ -240,13 +157,3 @@ def test_targets_at_50_hz(client):
     assert report["errors"] == []
     assert report["q"] == pytest.approx(report["goal"], abs=1e-3)
     assert report["mode"] == "Idle"
-
-
-def test_an_end_that_is_never_reported_hangs_the_library(client, emulator):
-    with pytest.raises(subprocess.TimeoutExpired):
-        client("unanswered", timeout=1.5)
-    assert emulator.wait_event("client gone", after=emulator.events("motion ended")[-1]["n"])
-
-
-def test_slow_answers(client):
-    assert client("slow", seconds=0.3)["seconds"] >= 0.3

@@ -65,51 +65,6 @@ def test_opening_reads_and_moves_nothing(bench):
     assert bench.requests == {"connect": 1, "homing": 0, "grasp": 0, "move": 0, "stop": 0}
 
 
-@pytest.mark.parametrize("ends_at_width", ["on", "off"])
-def test_widths_are_reached_whatever_a_grasp_of_nothing_does(ends_at_width):
-    with HandBench() as bench:
-        bench.command(f"grasp-ends-at-width {ends_at_width}")
-        for width in (0.06, 0.03):
-            bench.hand.move(width, 0.1, 40.0)
-            assert bench.read().outcome is GripperOutcome.RUNNING
-            assert bench.finish().outcome is DONE
-            reading = bench.wait(lambda r: not r.moving)  # two states, one after the other, with the same width
-            assert (reading.outcome, reading.grasped) == (DONE, False)
-            assert (reading.width, reading.width_target) == (pytest.approx(width, abs=0.002), width)
-        newest = bench.command("state")["newest"]
-        assert newest["grasp"] == [0.03, 0.0, 0.08, 0.1, 40.0]
-
-
-def test_what_a_move_closes_on_is_held_until_it_opens(bench):
-    bench.command("object 0.03")
-    reading = bench.do("move", 0.0, 0.1, 35.0)
-    assert (reading.outcome, reading.grasped, reading.width, reading.fault) == (MISSED, True, 0.03, None)
-    assert bench.command("state")["force"] == 35.0
-    before = bench.requests
-    bench.hand.move(0.01, 0.1, 35.0)
-    assert bench.do("stop").grasped
-    assert bench.requests == before
-    assert bench.command("state")["is_grasped"]
-    reading = bench.do("move", 0.05, 0.1, 35.0)
-    assert (reading.outcome, reading.grasped) == (DONE, False)
-
-
-def test_a_grasp_holds_what_has_the_right_width_only(bench):
-    bench.command("object 0.03")
-    assert (bench.do("grasp", 0.02, 0.1, 40.0, 0.005, 0.005).outcome, bench.read().grasped) == (MISSED, False)
-    bench.do("move", 0.04, 0.1, 40.0)
-    assert (bench.do("grasp", 0.03, 0.1, 50.0, 0.005, 0.005).outcome, bench.read().grasped) == (DONE, True)
-    assert bench.command("state")["newest"]["grasp"] == [0.03, 0.005, 0.005, 0.1, 50.0]
-    before = bench.requests
-    assert bench.do("grasp", 0.03, 0.1, 50.0, 0.005, 0.005).outcome is DONE
-    reading = bench.do("grasp", 0.03, 0.1, 60.0, 0.005, 0.005)
-    assert reading.outcome is FAILED
-    assert reading.fault.code == "holding"
-    assert bench.do("home").outcome is FAILED
-    assert bench.requests == before
-    assert bench.command("state")["is_grasped"]
-
-
 def test_a_hand_that_is_not_homed_reports_it_and_is_homed():
     with HandBench(homed=False) as bench:
         bench.server.fingers.width = 0.01
@@ -121,28 +76,6 @@ def test_a_hand_that_is_not_homed_reports_it_and_is_homed():
         reading = bench.do("home")
         assert (reading.outcome, reading.fault, reading.width) == (DONE, None, 0.08)
         assert bench.slowest < 0.3  # the library's own call takes more than a second
-
-
-def test_a_stop_leaves_the_fingers_where_they_are(bench, brisk):
-    bench.hand.move(0.08, 0.02, 40.0)
-    bench.wait(lambda r: r.width > 0.041)
-    bench.hand.stop()
-    assert bench.read().outcome is STOPPED
-    width = bench.wait_server(lambda state: state["motion"] is None)["width"]
-    assert width < 0.08
-    reading = bench.wait(lambda r: not r.moving)
-    assert reading.width == width
-    bench.hand.stop()
-    bench.wait(lambda r: r.seq > reading.seq + 25)
-    assert (bench.read().width, bench.read().fault, bench.requests["stop"]) == (width, None, 1)
-
-
-def test_a_motion_that_the_hand_refuses_has_failed(bench):
-    bench.command("fail")
-    reading = bench.do("move", 0.08, 0.1, 40.0)
-    assert reading.outcome is FAILED
-    assert reading.fault.code == "hand_failed"
-    assert (bench.do("move", 0.05, 0.1, 40.0).outcome, bench.read().fault) == (DONE, None)
 
 
 def test_a_motion_that_is_never_answered_is_given_up(bench, brisk):
@@ -312,15 +245,6 @@ def test_invalid_options_of_the_emulated_hand_are_refused(bench):
     for words in ("dance", "object", "object wide", "stop-ignored maybe", "silence -1", "drop it"):
         with pytest.raises(ValueError, match=words.split()[0]):
             bench.command(words)
-
-
-def test_other_connections_are_closed():
-    with HandBench(connect=False) as bench:
-        with socket.create_connection((bench.host, 1338), timeout=5.0) as stranger:
-            stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
-            assert stranger.recv(10) == b""
-        bench.hand.open()
-        assert bench.read().width == 0.04
 
 
 class LateWorld:

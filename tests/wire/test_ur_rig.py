@@ -17,7 +17,11 @@ import numpy as np
 import pytest
 
 import hal
-from hal.config.data_files import find_data
+from hal.config import load
+from hal.drivers.ur.arm import find_tcp
+from hal.drivers.ur.preflight import check
+from hal_emulators.ur.controller import Controller
+from hal_emulators.ur.motion import forward
 
 from .test_ur_faults import recover, wait_code
 from .ur_kit import UrEmulator
@@ -151,18 +155,38 @@ def test_a_lost_state_now_and_then_stops_nothing(emulator: UrEmulator) -> None:
         assert emulator.status()["lost"] > 20
 
 
-def test_a_cb3_is_driven_at_125_hz(tmp_path: Path) -> None:
-    """Its PolyScope knows no remote control; the model is one of a user's own."""
-    text = find_data("robots", "ur5e.yaml").read_text(encoding="utf-8")
-    (tmp_path / "my_ur5.yaml").write_text(text.replace("rate_hz: 500", "rate_hz: 125"), encoding="utf-8")
-    emulator = UrEmulator("--robot", "ur5")
+@pytest.mark.parametrize("robot", ["ur5", "ur20"])
+def test_other_arms_are_driven_by_their_models(robot: str) -> None:
+    """The first is a CB3, with 125 Hz and without remote control."""
+    emulator = UrEmulator(robot=robot)
     try:
-        rig = emulator.rig()
-        rig["robots"]["arm"]["model"] = str(tmp_path / "my_ur5.yaml")
-        with hal.open(rig) as opened:
+        with hal.open(emulator.rig()) as opened:
             arm = opened.robots["arm"]
             goal = arm.home + 0.1
             assert arm.move_to(goal, unattended=True).q == pytest.approx(goal, abs=2e-3)
         assert not emulator.status()["program"]
+    finally:
+        emulator.close()
+
+
+def test_the_check_names_the_calibration_and_another_arm() -> None:
+    emulator = UrEmulator("--calibrated", robot="ur10e")
+    try:
+        spec = load(emulator.rig()).resolve().robots[0]
+        found = {result.name: result for result in check(spec, 0.2)}
+        assert list(found) == ["controller", "state", "calibration", "tcp", "payload", "states"]
+        assert found["state"].level == found["payload"].level == found["calibration"].level == "ok"
+        twin = Controller("ur10e", spec.home, 0.0, [0.0] * 6)
+        tcp = find_tcp(spec)
+        assert tcp is not None
+        before = forward(twin.dh, spec.home, tcp)[:3]
+        twin.calibrate(0)
+        off = 1e3 * np.linalg.norm(np.subtract(before, forward(twin.dh, spec.home, tcp)[:3]))
+        assert "a factory calibration, not used here: the model" in found["calibration"].found
+        assert found["calibration"].found.endswith(f"by {off:.1f} mm at home")
+        rig = emulator.rig()
+        rig["robots"]["arm"]["model"] = "ur16e"
+        found = {result.name: result for result in check(load(rig).resolve().robots[0], 0.2)}
+        assert found["calibration"].level == "fail"
     finally:
         emulator.close()

@@ -20,12 +20,12 @@ PORTS = (30001, 30002, 30003, 30004, 29999, 1339)
 
 
 class UrEmulator:
-    """A running emulator. ``options`` are those of its command line."""
+    """A running emulator of an arm. ``options`` are further ones of its command line."""
 
-    def __init__(self, *options: str) -> None:
+    def __init__(self, *options: str, robot: str = "ur5e") -> None:
         pytest.importorskip("rtde_control", reason="needs ur_rtde: pip install 'robot-hal[ur]'")
-        self.host = free_host(PORTS)
-        command = [sys.executable, "-m", "hal_emulators.ur", "--host", self.host, *options]
+        self.host, self.robot = free_host(PORTS), robot
+        command = [sys.executable, "-m", "hal_emulators.ur", "--host", self.host, "--robot", robot, *options]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
@@ -34,7 +34,7 @@ class UrEmulator:
 
     def rig(self, **real: Any) -> dict[str, Any]:
         """Return a rig with this arm."""
-        arm = {"model": "ur5e", "real": {"host": self.host, **real}, "gripper": {"enabled": False}}
+        arm = {"model": self.robot, "real": {"host": self.host, **real}, "gripper": {"enabled": False}}
         return {"sim": False, "robots": {"arm": arm}}
 
     def status(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from ...errors import CommandError
 from ..dataset import Dataset
+from ..layout import count_bytes
 from .actions import ActionForm, ActionKind, RotationForm
 from .content import EpisodeContent, select_episodes
 from .output import ExportJob, ExportProgress, write_atomically
@@ -131,9 +132,4 @@ def export(
     with write_atomically(path, force=force, is_ours=writer.is_export) as beside:
         writer.write(job, beside)
     rows = sum(content.rows for content in job.contents)
-    return ExportResult(path, len(job.contents), rows, _bytes(path), tuple(job.notes))
-
-
-def _bytes(path: Path) -> int:
-    files = [path] if path.is_file() else path.rglob("*")
-    return sum(file.stat().st_size for file in files if file.is_file())
+    return ExportResult(path, len(job.contents), rows, count_bytes(path), tuple(job.notes))

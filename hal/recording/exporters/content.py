@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ...errors import CommandError, DeviceNotFound
 from ...images import Cropping
 from ...types import STREAMS
+from ..changing import existing_episodes
 from ..dataset import Dataset, Episode
 from ..layout import GRIP_FORCE, MORE_STREAMS, STATE, TAU_EXT, WRENCH_EXT
 
@@ -48,18 +49,12 @@ def select_episodes(
     Raises:
         CommandError: There is no such episode, or none is left (code ``no_episodes``).
     """
-    there = range(len(dataset.episodes))
-    numbers = there if wanted is None else set(parse_episodes(wanted) if isinstance(wanted, str) else wanted)
-    if unknown := sorted(set(numbers) - set(there)):
-        raise CommandError(
-            f"there is no episode {unknown[0]} in {dataset.root}; there are {len(there)}, from 0 on", code="no_episodes"
-        )
-    found = [dataset.episodes[number] for number in sorted(numbers)]
-    if successful_only:
-        found = [episode for episode in found if episode.success]
+    numbers = range(len(dataset)) if wanted is None else wanted
+    chosen = existing_episodes(dataset, parse_episodes(numbers) if isinstance(numbers, str) else numbers)
+    found = [dataset.episodes[number] for number in sorted(chosen)]
+    found = [episode for episode in found if not successful_only or episode.success]
     if not found:
-        why = "none of these episodes is marked a success" if successful_only else "no episode was selected"
-        raise CommandError(why, code="no_episodes")
+        raise CommandError("none of these episodes is marked a success", code="no_episodes")
     return tuple(found)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CommandError
-from ..layout import STATE
+from ..layout import STATE, finish_replacement, put_in_place
 from .actions import ActionForm, rotation_observations
 from .content import EpisodeContent, PictureStream, observations
 
@@ -132,28 +132,17 @@ def write_atomically(path: Path, *, force: bool, is_ours: Callable[[Path], bool]
     _check(path, force=force, is_ours=is_ours)
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path)
-    beside = _make_path_beside(path, "partial")
+    beside = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield beside
         _check(path, force=force, is_ours=is_ours)  # it may have come meanwhile
-        _replace(path, beside)
+        if path.is_dir():
+            put_in_place(beside, path, replaces=True)
+        else:
+            beside.replace(path)
     except BaseException:
         _remove(beside)
         raise
-
-
-def _replace(path: Path, beside: Path) -> None:
-    if not path.is_dir():
-        beside.replace(path)
-        return
-    old = _make_path_beside(path, "old")  # a folder that is not empty cannot be replaced at once
-    path.rename(old)
-    try:
-        beside.rename(path)
-    except BaseException:
-        old.rename(path)
-        raise
-    _remove(old)
 
 
 def _check(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> None:
@@ -168,20 +157,13 @@ def _check(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> None:
         )
 
 
-def _make_path_beside(path: Path, what: str) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.{what}")
-
-
 def _sweep(path: Path) -> None:
     """Remove the temporary files of a killed program, and restore what it had just moved away."""
-    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.(partial|old)")
+    finish_replacement(path)
+    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.partial")
     for file in path.parent.iterdir():
         match = name.fullmatch(file.name)
-        if match is None or Path(f"/proc/{match[1]}").exists():
-            continue
-        if match[2] == "old" and not path.exists():
-            file.rename(path)
-        else:
+        if match is not None and not Path(f"/proc/{match[1]}").exists():
             _remove(file)
 
 

@@ -15,7 +15,7 @@ from hal.config import load
 from hal.config.data_files import find_data, list_data
 from hal.drivers.mock.camera import MockCamera
 from hal.errors import ConfigError, Problem
-from hal.specs import CameraSpec, from_json, to_json
+from hal.specs import CameraSpec
 
 LOOK = {"target": [0, 0, 0], "distance": 1.0}
 D435 = "realsense_d435"
@@ -182,12 +182,6 @@ class TestStreams:
         assert {(s.K, s.position) for s in spec.sensors.values()} == {(spec.K, (0, 0, 0))}
         assert spec.options == {}
 
-    def test_the_record_travels(self) -> None:
-        import json
-
-        spec = camera(streams=STEREO, simulated={"depth_noise": {"seed": 3}})
-        assert from_json(CameraSpec, json.loads(json.dumps(to_json(spec)))) == spec
-
     @pytest.mark.parametrize("rates", [(30, 30), (60, 30), (60, 15), (15, 90), (6, 30), (60, 6)])
     def test_rates_that_fit(self, rates: tuple[float, float]) -> None:
         spec = camera(streams={"color": {"rate_hz": rates[0]}, "depth": {"rate_hz": rates[1]}})
@@ -249,13 +243,6 @@ def test_a_real_camera_is_checked_alike() -> None:
     assert keys == ["cameras.eye.streams.segmentation", "cameras.eye.streams.color.format"]
 
 
-def test_an_override_may_choose_the_noise() -> None:
-    config = load("panda_table", overrides=["cameras.scene.simulated={depth_noise: {seed: 2}}"])
-    assert config.resolve().cameras[0].options["depth_noise"] == {"seed": 2}
-    (problem,) = problems("panda_table", overrides=["cameras.scene.simulated={depth_noise: 3}"])
-    assert (problem.file, problem.key) == ("--set", "cameras.scene.simulated.depth_noise")
-
-
 # A driver's own checks.
 
 LAB = """
@@ -295,10 +282,6 @@ def test_what_a_driver_finds_stands_where_it_was_written(lab: str) -> None:
     assert places(mine) == {("<dict>", "cameras.eye.real.preset"), ("<dict>", "cameras.eye.capture.rate_hz")}
     assert load(rig(lab, sim=False, real={"serial": "1", "preset": "even"})).resolve().cameras[0].driver != "pybullet"
     load(rig(lab))  # in simulation the real driver is not consulted
-
-
-def test_the_options_of_a_model_are_for_its_own_driver(lab: str) -> None:
-    assert camera(lab, sim=False, drivers={"real": "mock"}).options == {}
 
 
 # Models of one's own.

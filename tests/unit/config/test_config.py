@@ -57,31 +57,6 @@ def test_every_built_in_rig_is_valid(name: str) -> None:
     assert from_json(WorldSpec, json.loads(json.dumps(to_json(rig.world)))) == rig.world
 
 
-def test_the_tutorials_scene() -> None:
-    rig = plan("panda_table")
-    (panda,) = rig.robots
-    assert panda.base_position == (-0.55, 0.0, 0.6)
-    assert panda.home == panda.initial == (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
-    assert panda.gripper is not None
-    assert (panda.gripper.name, panda.gripper.width_max) == ("panda.gripper", 0.08)
-    assert rig.world is not None
-    bodies = {body.name: body for body in rig.world.bodies}
-    cube = bodies["cube"]
-    assert (cube.shape, cube.half_extents, cube.mass, cube.position) == (
-        "box",
-        (0.03, 0.015, 0.03),
-        2.0,
-        (0.0, -0.2, 0.631),
-    )
-    assert any(body.shape == "urdf" and not body.fixed for body in bodies.values())
-    cameras = {camera.name: camera for camera in rig.cameras}
-    assert {(c.width, c.height, c.rate_hz) for c in cameras.values()} == {(256, 256, 30.0)}
-    assert cameras["scene"].view is not None
-    assert cameras["scene"].view.robot is None
-    assert cameras["wrist"].view is not None
-    assert (cameras["wrist"].view.robot, cameras["wrist"].view.link) == ("panda", "panda_hand")
-
-
 def test_the_pandas_limits_are_the_published_ones() -> None:
     limits = plan("panda_table").robots[0].limits
     assert limits.lower[3] == -3.0718
@@ -316,15 +291,6 @@ def test_gripper_can_be_left_out_and_slowed() -> None:
     assert slow.speed == 0.05
 
 
-def test_pads() -> None:
-    (pad,) = plan("panda_table").pads
-    assert (pad.driver, pad.model) == ("auto", None)
-    assert len(pad.models) == len(list_data("sensors", "gamepads"))
-    named = plan({"gamepads": {"pad": {"model": "dualshock4", "driver": "evdev", "dead_zone": 0.1}}}).pads[0]
-    assert named.model is not None
-    assert named.dead_zone == 0.1
-
-
 @pytest.mark.parametrize("chosen", ["driver: playback", "sim: true", "sim: true, driver: playback"])
 def test_a_recording_is_relative_to_the_rig(tmp_path: Path, chosen: str) -> None:
     shutil.copy(find_data("config", "teleop/tour.jsonl"), tmp_path)
@@ -381,14 +347,6 @@ def test_output_is_the_captures_centre_scaled() -> None:
         x, y = project(cut.K, direction)
         assert (x + 0.5) / 256 == pytest.approx((u + 0.5 - 80) / 480)
         assert (y + 0.5) / 256 == pytest.approx((v + 0.5) / 480)
-
-
-def test_a_4_to_3_mode_of_the_d435_is_the_middle_of_its_sensor() -> None:
-    wide = camera(model="realsense_d435", capture={"width": 1280, "height": 720, "rate_hz": 30})
-    narrow = camera(model="realsense_d435", capture={"width": 640, "height": 480, "rate_hz": 30})
-    assert wide.K[0][0] == pytest.approx(640 / math.tan(math.radians(69.4 / 2)))
-    assert narrow.K[0][0] == pytest.approx(wide.K[0][0] * 480 / 720)
-    assert (wide.depth_min, narrow.depth_min) == (0.28, 0.175)
 
 
 @pytest.mark.parametrize(
@@ -451,26 +409,6 @@ def test_attached_rotation_turns_the_target_by_angles_or_quaternion() -> None:
     half = math.sqrt(0.5)
     same = camera(look_at=None, attached=place | {"rotation": [0, 0, half, half]}).view
     np.testing.assert_allclose(axes(same), axes(turned), atol=1e-12)
-
-
-def test_streams_as_list_or_with_formats() -> None:
-    assert camera(streams=["depth", "segmentation"]).streams == ("depth", "segmentation")
-    assert camera().streams == ("color", "depth")
-    real = {"model": "realsense_d435", "sim": False, "drivers": {"real": "mock"}}
-    real["streams"] = {"color": {"format": "bgr8"}, "depth": None}
-    (eye,) = plan({"cameras": {"eye": real}}).cameras
-    assert {name: sensor.format for name, sensor in eye.sensors.items()} == {"color": "bgr8", "depth": None}
-    assert eye.options == {}
-    assert eye.view is None  # a real one may stand anywhere
-
-
-def test_yaml_numbers_with_exponents_are_numbers(tmp_path: Path) -> None:
-    (tmp_path / "rig.yaml").write_text(
-        "simulation: {physics_hz: 1e3, gravity: [0, 0, -1e-3]}\nrobots: {a: {model: panda}}"
-    )
-    world = plan(tmp_path / "rig.yaml").world
-    assert world is not None
-    assert (world.physics_hz, world.gravity) == (1000.0, (0.0, 0.0, -0.001))
 
 
 def test_missing_inertials_are_a_warning(tmp_path: Path) -> None:

@@ -70,8 +70,8 @@ def test_a_mapping_of_the_user(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "key", "code"),
     [
-        ({"linear": {"x": {"axis": "dpad", "scale": 1.0}}}, "linear.x", "unknown_control"),
-        ({"linear": {"x": {"buttons": ["l1", "cross"], "scale": 1.0}}}, "linear.x", "unknown_control"),
+        ({"linear": {"x": {"axis": "dpad", "scale": 1.0}}}, "linear.x.axis", "unknown_control"),
+        ({"linear": {"x": {"buttons": ["l1", "cross"], "scale": 1.0}}}, "linear.x.buttons.1", "unknown_control"),
         ({"linear": {"x": {"scale": 1.0}}}, "linear.x", "missing_key"),
         ({"linear": {"x": {"axis": "dpad_x"}}}, "linear.x.scale", "missing_key"),
         ({"linear": {"x": {"axis": "dpad_x", "scale": 0.0}}}, "linear.x.scale", "out_of_range"),
@@ -79,7 +79,7 @@ def test_a_mapping_of_the_user(tmp_path: Path) -> None:
         ({"frame": "tool"}, "frame", "invalid_choice"),
         ({"deadman": "l4"}, "deadman", "unknown_control"),
         ({"gripper": {"open": "east"}}, "gripper", "missing_key"),
-        ({"gripper": {"toggle": "r9"}}, "gripper", "unknown_control"),
+        ({"gripper": {"toggle": "r9"}}, "gripper.toggle", "unknown_control"),
         ({"gripper": {"toggle": "r1", "axis": "r2"}}, "gripper", "conflict"),
         ({"gripper": {"toggle": "l2"}}, "", "duplicate_name"),
         ({"linear": {"x": {"axis": "l2", "scale": 1.0}}}, "", "duplicate_name"),

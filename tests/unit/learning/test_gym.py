@@ -110,25 +110,6 @@ if os.environ.get("HAL_SB3") == "1":  # not by default: PyTorch may bring gigaby
             env.close()
 
 
-def run(steps: int) -> bytes:
-    env = RigEnv("panda_table", EnvSettings(action="joint"), sim=True, overrides=BARE)
-    try:
-        seen, _ = env.reset(seed=7)
-        env.action_space.seed(7)
-        trace = [seen["q"]]
-        for _ in range(steps):
-            seen, *_ = env.step(env.action_space.sample())
-            trace += [seen["q"], seen["dq"], seen["tcp"], seen["gripper"], env.rig.world.pose("cube").position]
-        assert np.ptp([q[0] for q in trace[1::5]]) > 0.02, "it moved"
-        return np.concatenate(trace).tobytes()
-    finally:
-        env.close()
-
-
-def test_the_same_seed_and_actions_give_the_same_states_to_the_bit() -> None:
-    assert run(50) == run(50)
-
-
 def test_an_action_moves_the_arm_by_its_values() -> None:
     env = RigEnv("panda_table", EnvSettings(action="tcp_delta"), sim=True, overrides=BARE)
     try:
@@ -201,59 +182,6 @@ def test_a_stop_at_a_limit_names_the_limit() -> None:
         env.close()
 
 
-RANGES = "objects.3={file: duck, random: {x: [0.2, 0.3], y: [-0.3, 0.3], yaw_deg: [-180, 180]}}"
-
-
-@pytest.mark.slow
-def test_the_same_seed_starts_at_the_same_poses_to_the_bit_and_without_one_come_the_next() -> None:
-    class Drawing(RigEnv):
-        def arrange(self, options: dict[str, Any]) -> None:
-            self.np_random.uniform(size=1 if self.observation is None else 5)
-
-    env = Drawing("panda_table", EnvSettings(action="twist"), sim=True, overrides=(*BARE, RANGES))
-
-    def episode(seed: int | None) -> tuple[dict[str, bytes], bytes]:
-        seen, info = env.reset(seed=seed)
-        start = info["poses"]["cube"][:3]
-        beside = start - env.robot.base.position + [-0.1, 0.0, -0.05]
-        trace = [np.concatenate(list(seen.values()))]
-        for step in range(100):  # down beside the cube, then through its place
-            away = beside + [0.2 * (step > 70), 0.0, 0.0] - seen["tcp"][:3]
-            twist = away * min(5.0, 0.25 / max(np.linalg.norm(away), 1e-9))
-            seen, *_ = env.step(np.array([*twist, 0, 0, 0, 1], np.float32))
-            poses = [env.rig.world.pose(name) for name in ("cube", "duck")]
-            trace += [*seen.values(), *(part for pose in poses for part in (pose.position, pose.orientation))]
-        pushed.append(env.rig.world.pose("cube").position[0] - start[0])
-        return {name: pose.tobytes() for name, pose in info["poses"].items()}, np.concatenate(trace).tobytes()
-
-    pushed: list[float] = []
-    try:
-        first, second = episode(5), episode(None)
-        assert max(pushed) > 0.05
-        assert list(first[0]) == ["cube", "duck"]
-        assert len({poses[name] for poses, _ in (first, second) for name in ("cube", "duck")}) == 4
-        assert episode(5) == first, "the poses, and all that follows"
-        drawn = [env.reset(seed=seed)[1]["poses"]["cube"].tobytes() for seed in (6, None)]
-        assert len({first[0]["cube"], second[0]["cube"], *drawn}) == 4
-    finally:
-        env.close()
-
-
-def test_observations_show_objects_at_their_sampled_poses() -> None:
-    env = RigEnv("panda_table", EnvSettings(cameras=["scene"]), sim=True)
-    try:
-        pictures = []
-        for seed in (1, 1, 2):
-            seen, info = env.reset(seed=seed)
-            pictures.append(seen["scene_color"])
-            at = info["poses"]["cube"]
-            assert env.rig.world.pose("cube").position == pytest.approx(at[:3], abs=1e-6), "time stood still"
-        assert (pictures[0] == pictures[1]).all()
-        assert (pictures[0] != pictures[2]).any()
-    finally:
-        env.close()
-
-
 def test_poses_of_objects_are_observed_on_request() -> None:
     env = RigEnv("panda_table", EnvSettings(action="twist", objects=["duck", "cube"]), sim=True, overrides=BARE)
     try:
@@ -272,17 +200,6 @@ def test_poses_of_objects_are_observed_on_request() -> None:
         RigEnv("panda_table", EnvSettings(objects=["cup"]), sim=True, overrides=BARE)
     with raises_code(hal.NotSupported, "no_world"):
         RigEnv("panda_table", EnvSettings(objects=["cube"]), driver="mock", overrides=BARE)
-
-
-def test_ranges_without_room_are_an_error() -> None:
-    full = "objects.3={file: duck, random: {x: [0, 0], y: [0, 0]}}"
-    here = "objects.2={file: cube, random: {x: [0, 0], y: [0, 0]}}"
-    env = RigEnv("panda_table", sim=True, overrides=(*BARE, full, here))
-    try:
-        with raises_code(hal.CommandError, "no_room"):
-            env.reset(seed=1)
-    finally:
-        env.close()
 
 
 class Forward(RigEnv):
@@ -378,25 +295,21 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
         env.close()
 
 
-def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
-    for wrong in ({"action": "jump"}, {"robots": "pandda"}, {"cameras": ["wirst"]}):
-        with pytest.raises(hal.HalError):
-            RigEnv("panda_table", EnvSettings(**wrong), driver="mock")
-
-
 @pytest.mark.parametrize(
     ("wrong", "code"),
     [
         ({"rate_hz": 0.0}, "bad_command"),
         ({"rate_hz": 0.5}, "rate_too_low"),
         ({"action": "jump"}, "unknown_action"),
+        ({"robots": "pandda"}, "no_robot"),
+        ({"cameras": ["wirst"]}, "no_camera"),
         ({"controller": "impedance"}, "bad_controller"),
         ({"controller": hal.JointImpedance(stiffness=[1.0])}, "bad_controller"),
         ({"controller": hal.JointImpedance(), "action": "torque"}, "torques_by_controller"),
     ],
 )
 def test_arguments_of_later_calls_are_checked_at_once(wrong: dict[str, object], code: str) -> None:
-    with raises_code(hal.CommandError, code):
+    with raises_code(hal.HalError, code):
         RigEnv("panda_table", EnvSettings(**wrong), driver="mock", overrides=BARE)  # type: ignore[arg-type]
     with raises_code(hal.CommandError, "not_callable"):
         RigEnv("panda_table", driver="mock", deadman="pad")  # type: ignore[arg-type]

@@ -18,12 +18,6 @@ Rig = hal.Rig
 UP = hal.Twist([0.0, 0.0, 0.05])
 
 
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        yield rig
-
-
 def height(rig: Rig) -> float:
     return float(rig.robots["panda"].state().tcp.position[2])
 
@@ -133,20 +127,6 @@ def test_the_policy_is_called_at_its_rate_until_the_time_is_over(rig: Rig) -> No
     assert gripper.state().width < 0.005
     assert outcome.inference["p50"] is not None
     assert is_at_rest(rig)
-
-
-def test_a_policy_drives_with_the_controller_that_it_is_given(rig: Rig) -> None:
-    seen: list[hal.ControlMode] = []
-
-    def policy(observation: hal.Observation) -> hal.Twist:
-        seen.append(observation.robots["panda"].controller)
-        return UP
-
-    before = height(rig)
-    outcome = PolicyRunner(rig, policy, rate_hz=20, seconds=1.0, controller=hal.OperationalSpace()).run()
-    assert outcome.ended == "time"
-    assert seen[-1] is hal.ControlMode.OPERATIONAL_SPACE
-    assert height(rig) - before > 0.03
 
 
 def test_turns_without_a_newer_observation_are_counted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,22 +299,3 @@ def test_without_the_dead_man_the_policy_is_not_called_and_time_pauses(rig: Rig)
     assert min(asked) >= 0.5
     assert not [t for t in asked if 1.05 < t < 2.0]
     assert max(asked) > 2.5
-
-
-def test_a_pad_that_freezes_stops_it(rig: Rig) -> None:
-    hand, start = rig.driver("pad"), rig.clock.now()
-
-    def on_turn(seconds: float) -> None:
-        elapsed = rig.clock.now() - start
-        if elapsed > 0.3:
-            hand.press("l2")
-        if elapsed > 1.0:
-            hand.inject(freeze=True)
-        assert elapsed < 5.0
-
-    runner = PolicyRunner(rig, lambda o: UP, deadman=rig.gamepads["pad"].hold("l2"))
-    outcome = runner.run(on_turn=on_turn)
-    assert outcome.ended == "stopped"
-    assert outcome.reason
-    hand.inject(freeze=False)
-    assert is_at_rest(rig)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -22,12 +21,6 @@ CONFIG: dict[str, Any] = {
 }
 LEFT: dict[str, Any] = {"robot": "left", "columns": [0, 7], "kind": "joint_position"}
 RIGHT = {**LEFT, "robot": "right", "columns": [7, 14]}
-
-
-@pytest.fixture
-def rig() -> Iterator[hal.Rig]:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        yield rig
 
 
 # What a policy sees.

@@ -6,14 +6,13 @@ import asyncio
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import aiohttp
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from remote_policy_kit import CONFIG, STEPS, assert_within_limits, run, sine, stay
+from remote_policy_kit import CONFIG, STEPS, assert_within_limits, run, stay
 
 import hal
 from hal.learning.asynchronous import RemotePolicy
@@ -24,12 +23,6 @@ from hal.learning.remote import PolicyClient, PolicyServer, pack
 pytest.importorskip("msgpack")
 
 Rig = hal.Rig
-
-
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        yield rig
 
 
 # What a server can do wrong.
@@ -159,29 +152,6 @@ def test_a_first_target_far_away_is_refused(rig: Rig) -> None:
     assert isinstance(outcome.error, hal.CommandError)
 
 
-def test_a_server_that_freezes_stops_the_arm_within_its_last_chunk(rig: Rig) -> None:
-    wave, calls, ended = sine(rig), [], threading.Event()
-
-    def infer(request: dict[str, Any]) -> dict[str, Any]:
-        calls.append(rig.clock.now())
-        if len(calls) == 3:
-            ended.wait(10.0)  # as if the server were frozen
-        t = rig.clock.now() + np.arange(STEPS) / 15
-        return {"actions": np.array([[*wave(x), 0.0] for x in t])}
-
-    with PolicyServer(infer) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url, timeout=0.3), load_policy_config(CONFIG))
-        try:
-            outcome = PolicyRunner(rig, policy, rate_hz=50, seconds=5.0, cameras=()).run()
-        finally:
-            ended.set()
-            policy.close()
-    assert isinstance(outcome.error, hal.PolicyError)
-    assert outcome.error.code == "policy_timeout"
-    assert rig.clock.now() < calls[-1] + STEPS / 15 + 1.0
-    assert np.abs(rig.robots["panda"].state().dq_set).max() < 1e-9
-
-
 def test_a_request_that_the_server_does_not_take_closes_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     async def block(*_: Any) -> None:
         await asyncio.sleep(60.0)  # as a full buffer does
@@ -286,23 +256,6 @@ def test_no_server_is_an_error_before_anything_moves(rig: Rig) -> None:
     policy.close()
 
 
-def test_a_new_connection_is_made_for_the_next_episode(rig: Rig) -> None:
-    calls: list[int] = []
-
-    def infer(request: dict[str, Any]) -> dict[str, Any]:
-        calls.append(1)
-        if len(calls) == 2:
-            raise ValueError("once")
-        return stay(request)
-
-    with PolicyServer(infer) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
-        runner = PolicyRunner(rig, policy, rate_hz=50, seconds=1.0, cameras=())
-        outcomes = [runner.run(), runner.run()]
-        assert [outcome.ended for outcome in outcomes] == ["error", "time"]
-        policy.close()
-
-
 def test_an_answer_from_before_a_pause_is_not_used(rig: Rig) -> None:
     requests: list[int] = []
 
@@ -344,18 +297,12 @@ ARENA: dict[str, Any] = {
 
 def test_a_roboarena_server_is_reset_and_told_its_session(rig: Rig) -> None:
     seen: list[dict[str, Any]] = []
-    with PolicyServer(stay, reset=seen.append, metadata=ARENA) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
-        assert PolicyRunner(rig, policy, rate_hz=50, seconds=0.5, cameras=()).run(seed=7).ended == "time"
-        policy.close()
+    assert run(rig, stay, reset=seen.append, metadata=ARENA, seconds=0.5).ended == "time"
     assert [sorted(request) for request in seen] == [["session_id"]]
 
 
 def test_a_reset_that_fails_on_the_server_is_named_as_the_cause(rig: Rig) -> None:
-    with PolicyServer(stay, reset=fails, metadata=ARENA) as server:
-        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
-        outcome = PolicyRunner(rig, policy, rate_hz=50, seconds=0.5, cameras=()).run()
-        policy.close()
+    outcome = run(rig, stay, reset=fails, metadata=ARENA, seconds=0.5)
     assert isinstance(outcome.error, hal.PolicyError)
     assert (outcome.error.code, outcome.turns) == ("policy_error", 0)
 

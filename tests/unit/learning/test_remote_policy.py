@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,6 @@ from hal.learning.remote import PolicyClient, PolicyServer, pack, unpack
 pytest.importorskip("msgpack")
 
 Rig = hal.Rig
-
-
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        yield rig
 
 
 # Messages.

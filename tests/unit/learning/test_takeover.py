@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,6 @@ from hal.learning.takeover import Takeover
 
 Rig = hal.Rig
 SIDES = {"left": 0.6, "right": -0.6}
-
-
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        yield rig
 
 
 class Wave:

@@ -125,7 +125,7 @@ def test_what_a_killed_program_left_is_removed_and_what_runs_is_left_alone(tmp_p
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     (tmp_path / f".out.{gone.pid}.partial").mkdir()
-    old = tmp_path / f".out.{gone.pid}.old"
+    old = tmp_path / ".out.replaced"
     old.mkdir()
     (old / "kept").touch()
     other = tmp_path / f".out.{os.getppid()}.partial"

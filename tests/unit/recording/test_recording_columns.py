@@ -98,12 +98,6 @@ def test_an_object_that_is_taken_away_is_not_known_any_more(tmp_path: Path) -> N
     assert set(episode.info["objects_at_start"]) == {"floor", "table", "cube", "duck"}
 
 
-def test_infrared_that_is_left_out_is_noted(tmp_path: Path) -> None:
-    streams = "cameras.scene.streams={color: {format: bgr8}, infrared: {format: y8}}"
-    with mock_rig("lock_step", streams) as rig, Recorder(rig, tmp_path / "out") as recorder:
-        assert recorder.notes == ["camera scene: infrared not recorded"]
-
-
 def test_columns_without_an_open_pad_match_those_with_one(tmp_path: Path) -> None:
     for pad in (None, "none"):
         with (

@@ -71,14 +71,6 @@ def test_the_mark_survives_a_killed_writer(tmp_path: Path, mark: bool) -> None:
     assert check_layout(tmp_path / "out")["total_episodes"] == 2
 
 
-def test_the_next_recording_recovers_by_itself(out: Path) -> None:
-    with mock_rig() as rig, Recorder(rig, out) as recorder:
-        record(recorder, 0.2)
-        assert recorder.notes == ["000001.partial was not finished: recovered as episode 1"]
-        assert recorder.status().episode == 2
-    assert check_layout(out)["total_episodes"] == 3
-
-
 @pytest.mark.parametrize("name", ["rows.arrow", "scene.mp4", "wrist.depth"])
 def test_a_live_file_may_end_at_any_byte(torn: Path, tmp_path: Path, name: str) -> None:
     whole = next(torn.glob("episodes/*.partial"))

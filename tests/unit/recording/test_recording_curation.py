@@ -14,9 +14,8 @@ from recording_kit import check_layout, drive, join_metadata, make_recording, mo
 
 from hal.apps.dataset import main
 from hal.errors import CommandError
-from hal.recording import Dataset, Episode, KeptRows, Recorder, curation, find_motion, layout, split, trim
+from hal.recording import Dataset, Episode, KeptRows, Recorder, curation, find_motion, split, trim
 from hal.recording.checking import check_dataset
-from hal.recording.layout import DatasetLayout, lock_dataset
 
 LAST = {"next.success", "next.done"}
 NUMBERED = {"index", "frame_index", "timestamp", "episode_index", "task_index"}
@@ -228,17 +227,3 @@ def test_a_split_appears_whole_or_not_at_all(still: Dataset, tmp_path: Path, mon
     (tmp_path / "out").mkdir()
     with raises_code(CommandError, "output_exists"):
         split(still.root, {"a": [0]}, tmp_path / "out")
-
-
-def test_a_split_removes_what_a_killed_one_left_but_not_that_of_a_live_one(
-    still: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    building = DatasetLayout(tmp_path / ".out.splitting")
-    (building.root / "parts/a/data").mkdir(parents=True)
-    monkeypatch.setattr(layout, "_PATIENCE", 0.0)
-    with lock_dataset(building), raises_code(CommandError, "dataset_locked"):
-        split(still.root, {"a": [0]}, tmp_path / "out")
-    assert (building.root / "parts/a/data").exists()
-    assert split(still.root, {"a": [0]}, tmp_path / "out") == {"a": 1}
-    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.glob("*/*"))] == ["out/a"]
-    assert list(check_dataset(Dataset(tmp_path / "out/a"))) == []

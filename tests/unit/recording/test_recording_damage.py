@@ -169,34 +169,15 @@ def checked(root: Path) -> list[str]:
         return [str(error)]
 
 
-def test_an_undamaged_dataset_passes_the_check(whole: Path) -> None:
-    assert checked(whole) == []
-
-
 @pytest.mark.slow
+@pytest.mark.parametrize("exact", [True, False])
 def test_a_changed_bit_is_an_error_or_changes_nothing(
-    whole: Path, right: list[list[Arrays]], tmp_path: Path, rig: Rig
+    whole: Path, right: list[list[Arrays]], tmp_path: Path, rig: Rig, exact: bool
 ) -> None:
-    """Not of a video, which has no checksums, nor of JSON, where it may be another valid text."""
-    dice = random.Random(5)
-    originals = [path for path in files(whole) if path.suffix not in (".mp4", ".json")]
-    seen = 0
-    for _ in range(FLIPS):
-        name = dice.choice(originals).relative_to(whole)
-        root = Path(shutil.copytree(whole, tmp_path / "demo"))
-        flip(root / name, dice)
-        seen += bool(read_all(root, number_of(name) or 0, right, tmp_path, rig))
-        checked(root)
-        shutil.rmtree(root)
-    assert seen > FLIPS / 4
-
-
-@pytest.mark.slow
-def test_a_changed_bit_in_json_or_video_leads_to_no_other_error(
-    whole: Path, right: list[list[Arrays]], tmp_path: Path, rig: Rig
-) -> None:
-    dice = random.Random(6)
-    originals = [path for path in files(whole) if path.suffix in (".mp4", ".json")]
+    """In a video, which has no checksums, and in JSON, it may be other valid content, but is no other error."""
+    dice = random.Random(5 if exact else 6)
+    originals = [path for path in files(whole) if exact == (path.suffix not in (".mp4", ".json"))]
+    other = () if exact else (AssertionError, CommandError, DeviceNotFound)  # other numbers, other names
     seen = 0
     for _ in range(FLIPS):
         name = dice.choice(originals).relative_to(whole)
@@ -204,11 +185,11 @@ def test_a_changed_bit_in_json_or_video_leads_to_no_other_error(
         flip(root / name, dice)
         try:
             seen += bool(read_all(root, number_of(name) or 0, right, tmp_path, rig))
-        except (AssertionError, CommandError, DeviceNotFound):  # other numbers, other names
+        except other:
             seen += 1
         checked(root)
         shutil.rmtree(root)
-    assert seen > FLIPS / 10
+    assert seen > FLIPS / (4 if exact else 10)
 
 
 def flip(path: Path, dice: random.Random) -> None:
@@ -256,17 +237,6 @@ def test_nothing_is_recorded_over_episodes_whose_index_is_lost(out: Path, rig: R
         record(recorder, 0.3)
         assert recorder.status().episode == 3
     check_layout(out)
-
-
-def test_the_index_comes_back_as_it_was(whole: Path, out: Path) -> None:
-    shutil.rmtree(out / "meta")
-    repair(out)
-    old, new = index_files(whole), index_files(out)
-    assert old["info"] == new["info"]
-    assert old["tasks"] == new["tasks"]
-    assert old["stats"].keys() == new["stats"].keys()
-    for key, values in old["stats"].items():
-        assert np.allclose(values, new["stats"][key], atol=1e-6), key
 
 
 @pytest.mark.parametrize(

@@ -38,13 +38,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_layout_is_that_of_a_lerobot_dataset(made: Path) -> None:
-    info = check_layout(made)
-    assert (info["total_episodes"], info["total_tasks"], info["fps"], info["robot_type"]) == (3, 2, 30, "panda")
-    assert info["features"]["observation.state"]["names"][-1] == "gripper"
-    assert info["features"]["observation.images.wrist"]["shape"] == [48, 64, 3]
-
-
 def test_an_episode_has_the_metadata_of_its_source(made: Path) -> None:
     episodes = Dataset(made).episodes
     assert [episode.task for episode in episodes] == ["lift", "lower", "lower"]
@@ -170,17 +163,6 @@ def test_differences_are_reported_before_anything_is_written(made: Path) -> None
         "choose a new folder",
     ], "each once, and in words"
     assert sorted(str(path) for path in made.rglob("*")) == before
-
-
-def test_depth_is_kept_by_all_episodes_or_by_none(tmp_path: Path) -> None:
-    with mock_rig() as rig:
-        with Recorder(rig, tmp_path, depth=False) as recorder:
-            record(recorder, 0.1)
-        with raises_code(CommandError, "other_dataset"):
-            Recorder(rig, tmp_path)
-        with Recorder(rig, tmp_path, depth=False) as recorder:
-            record(recorder, 0.1)
-    assert check_layout(tmp_path)["total_episodes"] == 2
 
 
 def test_depth_in_another_unit_is_another_kind(made: Path, tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from hal.recording import (
     Dataset,
     Episode,
     Recorder,
-    building,
     delete_episodes,
     mark_episodes,
     merge,
@@ -209,7 +208,7 @@ def test_a_part_may_be_write_protected(part: Path, tmp_path: Path, monkeypatch: 
 def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(building, "GROUP", 3)
+    monkeypatch.setattr(merging, "GROUP", 3)
     demo = tmp_path / "demo"
     merge([part, part], demo)
     names = [[str(path.relative_to(demo)) for path in demo.glob(f"{kind}/*.*")] for kind in ("data/*", "videos/*/*")]
@@ -388,7 +387,7 @@ def test_two_merges_into_one_folder_exclude_each_other(
             merge([part], tmp_path / "out")
         assert (place.root / "data").exists()
         with pytest.raises(FileExistsError):
-            building.link_file(part / "meta/info.json", place.episodes / ".lock")
+            merging.link_file(part / "meta/info.json", place.episodes / ".lock")
     (place.root / "link").symlink_to("data")
     assert merge([part], tmp_path / "out") == 2, "what a killed program left is removed"
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["data", "depth", "episodes", "meta", "videos"]
@@ -429,7 +428,7 @@ def test_a_mount_point_is_not_replaced(part: Path, tmp_path: Path, monkeypatch: 
 def test_rows_stay_in_their_file_only_if_nothing_in_it_changes(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(building, "GROUP", 2)
+    monkeypatch.setattr(merging, "GROUP", 2)
     demo = tmp_path / "demo"
     merge([part, part], demo)
 
@@ -457,13 +456,13 @@ def test_large_videos_are_linked_and_small_ones_joined_up_to_a_size(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = (part / "videos/observation.images.wrist/chunk-000/file-000.mp4").stat().st_size
-    monkeypatch.setattr(building, "VIDEO_MB", 2.9e-6 * size)
+    monkeypatch.setattr(merging, "VIDEO_MB", 2.9e-6 * size)
     merge([part, part, part], joined := tmp_path / "joined")
     videos = [episode.place.video("wrist") for episode in Dataset(tmp_path / "joined").episodes]
     assert [file for file, _ in videos] == [0, 0, 1, 1, 2, 2]
     assert [first for _, first in videos[::2]] == [0, 0, 0]
     check_layout(tmp_path / "joined")
-    monkeypatch.setattr(building, "VIDEO_MB", 1.5e-6 * size)
+    monkeypatch.setattr(merging, "VIDEO_MB", 1.5e-6 * size)
     delete_episodes(joined, [0, 5])
     for one, other in zip(Dataset(part).episodes[::-1] * 2, Dataset(joined).episodes, strict=True):
         assert pictures_of(one, "color") == pictures_of(other, "color"), "a file of which a part is left is no link"

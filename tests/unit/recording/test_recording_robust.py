@@ -280,19 +280,6 @@ def test_a_task_may_be_any_text_and_a_seed_any_whole_number(rig: Rig, out: Path)
     assert [(episode.task, episode.info["seed"]) for episode in Dataset(out).episodes] == [(t, 7) for t in tasks]
 
 
-@pytest.mark.parametrize("fps", [math.nan, math.inf, -30, 241, 29.97])
-def test_a_rate_that_cannot_be(rig: Rig, out: Path, fps: float) -> None:
-    with raises_code(CommandError, "bad_fps"):
-        Recorder(rig, out, fps=fps)  # type: ignore[arg-type]
-
-
-def test_a_camera_that_is_named_twice_is_kept_once(rig: Rig, out: Path) -> None:
-    with Recorder(rig, out, cameras=["wrist", "wrist"]) as recorder:
-        record(recorder, 0.1)
-    check_layout(out)
-    assert Dataset(out).episodes[0].cameras == ("wrist",)
-
-
 # What others left behind.
 
 

@@ -20,7 +20,6 @@ from hal.driver import Setpoint
 from hal.drivers.can import damiao_chain, piper_link
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
-from hal.drivers.can.damiao_gripper import DamiaoGripper
 from hal.drivers.can.damiao_motor import ChainMotor, register_problems
 from hal.drivers.can.damiao_protocol import MotorRegister, MotorStatus
 from hal.drivers.can.piper import PiperArm
@@ -229,20 +228,6 @@ def test_a_time_out_that_is_too_short_or_too_long_is_refused(yam: Bench, seconds
     motor = DamiaoArm(yam.spec).settings.motors[0]
     found = [problem[2] for problem in register_problems(motor, {MotorRegister.TIMEOUT: round(seconds / 50e-6)})]
     assert found == ([code] if code else [])
-
-
-def test_a_gripper_whose_motor_restarts_does_not_go_on_by_itself(yam: Bench) -> None:
-    yam.arm.gripper.q = yam.arm.gripper.upper
-    driver = yam.open(DamiaoGripper(yam.spec.gripper))
-    driver.move(0.0, 0.05, 10.0)
-    yam.cycle(60)
-    yam.arm.motors[7].restart()
-    yam.cycle(20)
-    assert yam.arm.motors[7].status == MotorStatus.DISABLED
-    assert yam.reading.fault.code == "switched_off"
-    driver.move(0.0, 0.05, 10.0)
-    assert yam.cycle(50).fault is None
-    assert yam.arm.motors[7].status == MotorStatus.ENABLED
 
 
 def test_an_arm_whose_replies_would_command_another_one_is_refused(yam: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

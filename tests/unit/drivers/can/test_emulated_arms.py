@@ -12,29 +12,17 @@ from hal.drivers.can.damiao_protocol import (
     ENABLE,
     REGISTER_ID,
     MotorFeedback,
-    MotorRegister,
     MotorStatus,
-    decode_register_reply,
-    encode_register_read,
     encode_state_request,
 )
 from hal.drivers.can.piper_protocol import (
-    ENABLED,
     FEEDBACK_IDS,
     POSE_ID,
-    EnableRequest,
-    FirmwareQuery,
-    GripperRequest,
-    GripperStatus,
     JointAngles,
     JointStatus,
-    ModeRequest,
     PiperStatus,
     decode_feedback,
-    encode_joint_targets,
-    find_firmware,
 )
-from hal_emulators.can import piper as emulated_piper
 from hal_emulators.can.console import COMMANDS, execute
 from hal_emulators.can.damiao import EmulatedDamiaoArm
 from hal_emulators.can.piper import EmulatedPiperArm
@@ -91,17 +79,6 @@ def piper() -> Wire:
     return Wire("piper")
 
 
-def test_motors_answer_at_their_master_ids_and_show_their_registers(yam: Wire) -> None:
-    for motor in range(1, 8):
-        (answer,) = yam.ask(REGISTER_ID, encode_register_read(motor, MotorRegister.VMAX))
-        assert yam.sent[0][0] == motor + 0x10
-        assert decode_register_reply(answer, motor).value == (10.0 if motor <= 3 else 30.0)
-    (answer,) = yam.ask(REGISTER_ID, bytes((2, 0, 0x55, MotorRegister.TIMEOUT, 0, 0, 0, 0)))
-    assert decode_register_reply(answer, 2).value == 0
-    assert yam.ask(REGISTER_ID, encode_register_read(9, MotorRegister.VMAX)) == []
-    assert yam.ask(0x99, b"\0" * 8) == []
-
-
 def test_an_arm_is_held_until_all_its_motors_are_on_and_have_a_command(yam: Wire) -> None:
     start = yam.arm.plant.q.copy()
     yam.ask(1, ENABLE)
@@ -134,41 +111,6 @@ def test_silence_longer_than_timeout_ends_in_damping_until_the_error_is_cleared(
     assert yam.feedback(2).status == MotorStatus.ENABLED
 
 
-def test_a_timeout_of_zero_never_expires(yam: Wire) -> None:
-    for motor in range(1, 7):
-        yam.arm.set_register(motor, "timeout", 0)
-    yam.hold()
-    yam.let_pass(1.0)
-    assert yam.feedback(2).status == MotorStatus.ENABLED
-
-
-def test_a_motor_with_a_fault_or_without_power_follows_no_command(yam: Wire) -> None:
-    yam.hold()
-    yam.arm.set_status(3, 0xA)
-    codec = yam.arm.motors[3].codec
-    (answer,) = yam.ask(3, codec.encode_command(0.5, 0.0, 80.0, 5.0, 0.0))
-    assert codec.decode_feedback(answer).status == MotorStatus.OVER_CURRENT
-    assert yam.arm.motors[3].step(DT).kp == 0.0
-    yam.arm.restart()
-    assert yam.feedback(3).status == MotorStatus.DISABLED
-
-
-def test_directions_offsets_and_changed_ranges_show_in_the_feedback(yam: Wire) -> None:
-    motor = yam.arm.motors[2]
-    motor.settings = motor.settings.model_copy(update={"direction": -1.0, "offset": 0.5})
-    assert yam.feedback(2).q == pytest.approx(-(1.5 - 0.5), abs=1e-3)
-    yam.arm.set_register(1, "PMAX", 6.25)
-    (data,) = yam.ask(REGISTER_ID, encode_state_request(2))
-    yam.arm.set_register(2, "PMAX", 6.25)
-    (other,) = yam.ask(REGISTER_ID, encode_state_request(2))
-    assert data != other
-
-
-def test_temperatures_are_reported(yam: Wire) -> None:
-    yam.arm.set_temperature(4, 71, 96)
-    assert (yam.feedback(4).mosfet, yam.feedback(4).rotor) == (71, 96)
-
-
 def test_a_piper_reports_at_its_rates_without_being_asked(piper: Wire) -> None:
     sent = piper.let_pass(0.5)
     decoded = [decode_feedback(id, data) for id, data, _ in sent]
@@ -178,63 +120,6 @@ def test_a_piper_reports_at_its_rates_without_being_asked(piper: Wire) -> None:
     assert {id for id, *_ in sent} == set(FEEDBACK_IDS)
     unread = {id for (id, *_), record in zip(sent, decoded, strict=True) if record is None}
     assert unread == {POSE_ID, POSE_ID + 1, POSE_ID + 2}, "the driver does without the flange's pose"
-
-
-def switch_on(piper: Wire, speed_percent: int = 100) -> None:
-    piper.ask(*EnableRequest().frame())
-    piper.ask(*ModeRequest(speed_percent=speed_percent).frame())
-
-
-def test_a_piper_follows_targets_only_when_it_is_on_and_driven_over_can(piper: Wire) -> None:
-    start = piper.arm.plant.q.tolist()
-    goal = [q + 0.1 for q in start[:4]] + start[4:]
-    for frame in encode_joint_targets(goal):
-        piper.ask(*frame)
-    piper.let_pass(0.5)
-    assert piper.arm.plant.q.tolist() == pytest.approx(start)
-    switch_on(piper)
-    for frame in encode_joint_targets(goal):
-        piper.ask(*frame)
-    piper.let_pass(1.0)
-    assert piper.arm.plant.q.tolist() == pytest.approx(goal, abs=2e-3)
-    piper.let_pass(5.0)  # silence: it holds
-    assert piper.arm.plant.q.tolist() == pytest.approx(goal, abs=2e-3)
-    flags = [decode_feedback(id, data) for id, data, _ in piper.let_pass(0.05)]
-    assert {record.flags for record in flags if isinstance(record, JointStatus)} == {ENABLED}
-
-
-def test_a_pipers_speed_setting_bounds_its_motion(piper: Wire) -> None:
-    switch_on(piper, speed_percent=10)
-    piper.let_pass(0.1)
-    for frame in encode_joint_targets([0.5, *piper.arm.target[1:]]):
-        piper.ask(*frame)
-    piper.let_pass(1.0)
-    assert piper.arm.peak[0] == pytest.approx(0.1 * emulated_piper._SPEED, rel=0.05)
-
-
-def test_a_piper_refuses_targets_beyond_its_limits(piper: Wire) -> None:
-    switch_on(piper)
-    piper.ask(*encode_joint_targets([3.0, *piper.arm.target[1:]])[0])
-    assert piper.arm.target[0] == pytest.approx(0.0)
-    assert piper.arm.report()["status"] == "target_beyond_limit"
-
-
-def test_a_piper_without_power_falls(piper: Wire) -> None:
-    switch_on(piper)
-    piper.let_pass(0.2)
-    before = piper.arm.plant.q.copy()
-    piper.ask(*EnableRequest(enabled=False).frame())
-    piper.let_pass(0.3)
-    assert abs(piper.arm.plant.q - before).max() > 0.05
-
-
-def test_a_piper_tells_its_firmware_and_closes_its_gripper_on_an_object(piper: Wire) -> None:
-    assert find_firmware(piper.ask(*FirmwareQuery().frame())) == "S-V1.8-5"
-    piper.arm.set_object(0.03)
-    piper.ask(*GripperRequest(0.0, 1.0).frame())
-    reports = [decode_feedback(id, data) for id, data, _ in piper.let_pass(1.0)]
-    last = [record for record in reports if isinstance(record, GripperStatus)][-1]
-    assert (last.width, last.torque) == (pytest.approx(0.03), pytest.approx(-1.0))
 
 
 @pytest.fixture

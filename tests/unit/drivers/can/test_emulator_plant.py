@@ -8,7 +8,7 @@ import pytest
 
 from hal.config.loader import load
 from hal_emulators.can.damiao import shorted_damping
-from hal_emulators.can.plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
+from hal_emulators.can.plant import OFF, ArmPlant, Drive, JointMechanics
 
 KINEMATICS = load("yam", overrides=["cameras={}"]).resolve().robots[0].kinematics
 HOME = (0.0, 1.5, 1.35, -1.42, 0.0, 0.0)
@@ -25,19 +25,6 @@ def yam(mechanics=(BIG,) * 3 + (SMALL,) * 3, base=(0.0, 0.0, 0.0, 1.0)) -> ArmPl
 
 def holding(plant: ArmPlant, kp: float, kd: float) -> list[Drive]:
     return [Drive(q, 0.0, kp, kd, float(g)) for q, g in zip(HOME, plant.gravity(), strict=True)]
-
-
-def test_a_held_arm_stays_and_a_free_one_falls_to_its_stops() -> None:
-    plant = yam()
-    plant.held = True
-    for _ in range(100):
-        plant.step(DT, [OFF] * 6)
-    assert plant.q == pytest.approx(HOME)
-    plant.held = False
-    for _ in range(5000):
-        plant.step(DT, [OFF] * 6)
-    assert plant.q[1] == pytest.approx(plant.upper[1], abs=0.02)
-    assert np.abs(plant.dq[:3]).max() < 0.05
 
 
 def test_stiff_drives_on_light_wrists_are_stable() -> None:
@@ -119,15 +106,3 @@ def test_shorted_windings_damp() -> None:
     """DM4340: 1.5 (24 V / sqrt 3 / 5.445 rad/s)^2 / 0.65 ohm."""
     assert shorted_damping("DM4340") == pytest.approx(14.9, abs=0.1)
     assert shorted_damping("DM4310") == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_gripper_closes_on_an_object() -> None:
-    plant = GripperPlant(SMALL, 5.0, 0.0, 6.5)
-    for _ in range(1000):
-        plant.step(DT, Drive(q=0.0, kp=20.0, kd=0.5))
-    assert plant.q == pytest.approx(0.0, abs=0.01)
-    plant = GripperPlant(SMALL, 5.0, 2.0, 6.5)
-    for _ in range(1000):
-        plant.step(DT, Drive(q=1.9, kp=20.0, kd=0.5))
-    assert plant.q == pytest.approx(2.0, abs=0.01)
-    assert plant.tau == pytest.approx(-2.0, abs=0.1)

@@ -168,15 +168,6 @@ class TestGrasping:
             bench.world.step()
         assert abs(bench.world.pose("cube")["position"][2] - after[2]) < 1e-3
 
-    def test_a_grasp_of_the_right_width_presses_and_holds(self, bench: Bench) -> None:
-        bench.put_cube()
-        bench.hand.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
-        held = bench.run(1.0)[-1]
-        assert held.grasped, "a move to 30 mm would only touch it"
-        assert (held.width_target, held.force) == (0.0, pytest.approx(40.0, rel=0.2))
-        assert bench.run(2.0, bench.lift)[-1].grasped
-        assert bench.world.pose("cube")["position"][2] > 0.5
-
     def test_new_commands_to_close_leave_a_grasp_as_it_is(self, bench: Bench) -> None:
         """A policy and an analogue trigger send another width in every step."""
         bench.put_cube()
@@ -211,32 +202,6 @@ class TestGrasping:
         readings = bench.run(3.0)
         assert all(reading.moving for reading in readings)
         assert readings[-1].width == pytest.approx(0.077, abs=5e-4)
-
-    def test_a_grasp_of_nothing_closes(self, bench: Bench) -> None:
-        bench.hand.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
-        reading = bench.run(1.5)[-1]
-        assert (reading.moving, reading.grasped) == (False, False)
-        assert reading.width < 1e-3
-
-    def test_object_slips_with_too_little_force(self, bench: Bench) -> None:
-        bench.put_cube()
-        bench.hand.move(0.0, 0.1, 10.0)  # friction needs 20 N
-        assert bench.run(1.0)[-1].grasped
-        before = bench.world.pose("cube")["position"][2]
-        lifted = bench.run(2.0, bench.lift)[-1]
-        assert not lifted.grasped
-        assert bench.world.pose("cube")["position"][2] - before < 0.01
-
-    def test_open_releases_the_object(self, bench: Bench) -> None:
-        bench.put_cube()
-        bench.hand.move(0.0, 0.1, 40.0)
-        bench.run(1.0)
-        bench.run(1.5, bench.lift)
-        held = bench.world.pose("cube")["position"][2]
-        bench.hand.move(0.08, 0.1, 40.0)
-        reading = bench.run(1.5)[-1]
-        assert not reading.grasped
-        assert held - bench.world.pose("cube")["position"][2] > 0.05
 
 
 def distance(world: Any) -> float:

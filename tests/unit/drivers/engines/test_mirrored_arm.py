@@ -13,7 +13,7 @@ from engines_kit import Engine, joint_positions
 from errors_kit import raises_code
 from specs import PANDA_HOME, box, cube, floor, panda
 
-from hal.errors import CommandError, DeviceNotFound
+from hal.errors import CommandError
 from hal.kinematics.arm import Kinematics
 from hal.specs import BodySpec
 
@@ -134,33 +134,3 @@ def test_reset_leaves_it_at_the_real_arm(world: Any) -> None:
         world.reset("arm")
     with raises_code(CommandError, "is_robot"):
         world.set_pose("arm", {"position": [0, 0, 1]})
-
-
-@pytest.mark.parametrize(
-    ("q", "dq", "width"),
-    [
-        ([0.0] * 6, REST, 0.04),
-        (REST, [0.0] * 8, 0.04),
-        ([math.nan, *REST[1:]], REST, 0.04),
-        (REST, [math.inf, *REST[1:]], 0.04),
-        (REST, REST, math.nan),
-        (None, REST, 0.04),
-    ],
-)
-def test_impossible_states_are_refused(world: Any, q: list[float], dq: list[float], width: float) -> None:
-    with pytest.raises(CommandError):
-        world.follow("arm", q, dq, width)
-    world.step()
-    assert joints(world) == pytest.approx(PANDA_HOME, abs=1e-4)
-    assert joints(world, FINGERS) == pytest.approx(0.04, abs=1e-4)
-
-
-def test_only_a_mirrored_arm_takes_states(engine: Engine, world: Any) -> None:
-    with raises_code(DeviceNotFound, "unknown_body"):
-        world.follow("arn", PANDA_HOME, REST, None)
-    with raises_code(CommandError, "not_mirrored"):
-        world.follow("floor", PANDA_HOME, REST, None)
-    simulated = engine.world(panda("arm"))
-    with raises_code(CommandError, "not_mirrored"):
-        simulated.follow("arm", PANDA_HOME, REST, None)
-    simulated.close()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from specs import IIWA_HOME, PANDA_HOME, box, floor, iiwa, panda
 
 from hal import registry
-from hal.driver import Reading, RobotDriver, Setpoint
+from hal.driver import RobotDriver, Setpoint
 from hal.errors import CommandError
 from hal.specs import BodySpec, RobotSpec
 
@@ -151,18 +151,6 @@ class TestHolding:
             assert np.abs(np.subtract(driver.read(0.0).q, PANDA_HOME)).max() < 2e-3
             assert np.abs(driver.read(0.0).tau or ZERO).max() > 10.0  # it carries its own weight
 
-    def test_halt_holds_the_last_set_point(self, engine: Engine) -> None:
-        world, driver = opened(engine)
-        follow(world, driver, 0.5)
-        last = driver.read(0.0).q_commanded
-        driver.halt()
-        driver.halt()
-        for _ in range(240):
-            world.step()
-        reading = driver.read(0.0)
-        assert (reading.q, reading.q_commanded) == (pytest.approx(last, abs=1e-4), last)
-        assert np.abs(reading.dq).max() < 1e-4
-
     def test_it_stops_at_a_wall_within_its_torques(self, engine: Engine) -> None:
         world, driver = opened(engine, None, box("wall", (0.5, 0.2, 0.5), (0.3, 0.02, 0.5)))
         home, torques, deepest = np.array(PANDA_HOME), [], 0.0
@@ -183,28 +171,6 @@ class TestHolding:
 
 
 class TestReadings:
-    def test_stamps_and_units(self, engine: Engine) -> None:
-        world, driver = opened(engine)
-        first = driver.read(5.0)
-        world.step()
-        second = driver.read(6.0)
-        assert (first.t, first.t_device, first.seq) == (5.0, 0.0, 0)
-        assert (second.t, second.t_device, second.seq) == (6.0, world.dt, 1)
-        assert second.q == pytest.approx(PANDA_HOME, abs=1e-4)
-        assert second.tau_ext is None
-
-    def test_what_was_commanded_is_known_once_something_was(self, engine: Engine) -> None:
-        world, driver = opened(engine)
-        assert driver.read(0.0).q_commanded is None
-        setpoint = swing(0.3, np.array(PANDA_HOME))
-        driver.write(setpoint)
-        reading = driver.read(0.0)
-        assert (reading.q_commanded, reading.dq_commanded) == (setpoint.q, setpoint.dq)
-        world.reset("panda", q=[0.1, *PANDA_HOME[1:]])
-        reading = driver.read(0.0)
-        assert reading.q_commanded == pytest.approx([0.1, *PANDA_HOME[1:]])
-        assert reading.dq_commanded == [0.0] * 7
-
     def test_two_arms_do_not_disturb_each_other(self, engine: Engine) -> None:
         left, right = panda("left"), iiwa("right", base_position=(0.0, 1.5, 0.0))
         world = engine.world(floor(), left, right)
@@ -214,38 +180,6 @@ class TestReadings:
         errors, _ = follow(world, one, 1.0)
         assert np.abs(errors).max() < 1e-4
         assert other.read(0.0).q == pytest.approx(IIWA_HOME, abs=1e-3)
-
-
-class TestFaults:
-    def test_freeze_repeats_the_reading_while_the_arm_moves_on(self, engine: Engine) -> None:
-        world, driver = opened(engine)
-        frozen = driver.read(1.0)
-        driver.inject(freeze=True)
-        follow(world, driver, 0.5)
-        assert driver.read(2.0) is frozen
-        driver.recover()
-        assert moved(driver.read(3.0), frozen)
-
-    def test_a_fault_is_reported_and_holds_the_arm(self, engine: Engine) -> None:
-        world, driver = opened(engine)
-        follow(world, driver, 0.5)
-        driver.inject(fault="collision")
-        at_fault = driver.read(0.0)
-        assert at_fault.fault.cause == "collision"
-        for tick in range(240):
-            driver.write(swing(0.5 + tick * world.dt, np.array(PANDA_HOME)))
-            world.step()
-        assert driver.read(0.0).q == pytest.approx(at_fault.q, abs=0.02)
-        assert driver.read(0.0).q_commanded == pytest.approx(at_fault.q)
-        driver.recover()
-        assert driver.read(0.0).fault is None
-        here = driver.read(0.0).q
-        driver.write(Setpoint([here[0] + 0.01, *here[1:]], ZERO, ZERO))
-        assert driver.read(0.0).q_commanded == [here[0] + 0.01, *here[1:]]
-
-
-def moved(one: Reading, other: Reading) -> bool:
-    return float(np.abs(np.subtract(one.q, other.q)).max()) > 0.1
 
 
 def test_a_world_is_needed(engine: Engine) -> None:

@@ -208,39 +208,6 @@ def test_times_are_on_the_clock_of_the_rig(system: FakeInput, make_pad: MakePad)
     assert 999.9 < reading.t_alive <= 1000.1
 
 
-@pytest.mark.parametrize("hang_up", [True, False])
-def test_unplugging_releases_everything_until_replugged(system: FakeInput, make_pad: MakePad, hang_up: bool) -> None:
-    node = system.plug(DS4)
-    pad = make_pad()
-    node.send(*REST, (EV_ABS, ABS["ABS_X"], 255), (EV_KEY, KEY["BTN_TL"], 1))
-    held = poll(pad)
-    assert (held.axes["left_x"], held.buttons, pad.proves_liveness) == (1.0, {"l1"}, True)
-    system.unplug(node, hang_up=hang_up)
-    gone = poll(pad)
-    assert (gone.connected, any(gone.axes.values()), gone.buttons) == (False, False, frozenset())
-    assert gone.seq > held.seq
-    assert (gone.t_alive, node.open_ends) == (held.t_alive, 0)
-    assert not pad.proves_liveness
-
-    again = system.plug(DS4, number=5)
-    back = poll_until(pad, lambda reading: reading.connected)
-    assert all(abs(value) < 0.01 for value in back.axes.values())
-    assert pad.describe().endswith("event5)")
-    again.send(*REST, (EV_ABS, ABS["ABS_X"], 0))
-    news = poll(pad)
-    assert (news.axes["left_x"], news.connected) == (-1.0, True)
-    assert news.seq > gone.seq
-
-
-def test_poll_returns_on_an_event_and_on_unplugging(system: FakeInput, make_pad: MakePad) -> None:
-    node = system.plug(DS4)
-    pad = make_pad()
-    node.send(*REST)
-    assert pad.poll(time.monotonic(), 60.0).seq == 7
-    system.unplug(node)
-    assert not pad.poll(time.monotonic(), 60.0).connected
-
-
 def test_state_is_read_again_after_dropped_events(system: FakeInput, make_pad: MakePad) -> None:
     node = system.plug(DS4)
     pad = make_pad()
@@ -438,16 +405,6 @@ def test_unknown_options_are_refused(make_pad: MakePad) -> None:
     with pytest.raises(ConfigError) as caught:
         make_pad(devise="/dev/input/event3")
     assert [(problem.file, problem.key) for problem in caught.value.problems] == [("gamepads.pad", "devise")]
-
-
-def test_close_closes_the_device_and_is_idempotent(system: FakeInput, make_pad: MakePad) -> None:
-    node = system.plug(DS4)
-    pad = make_pad()
-    assert node.open_ends == 1
-    pad.close()
-    pad.close()
-    assert node.open_ends == 0
-    assert not poll(pad).connected
 
 
 def test_missing_library_is_an_error(monkeypatch: pytest.MonkeyPatch, pad_spec: PadSpec) -> None:

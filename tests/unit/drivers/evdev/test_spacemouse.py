@@ -143,33 +143,6 @@ def test_cap_pushed_while_plugging_in_must_be_released_first(system: FakeInput, 
     assert (pad.state().axis("push_y"), deadman.held) == (1.0, True)
 
 
-def test_unplugging_while_pushed_needs_a_new_press(system: FakeInput, make_pad: MakePad) -> None:
-    node = system.put(rel_node(), COMPACT)
-    pad = Gamepad(make_pad())
-    pad.open(time.monotonic())
-    deadman = pad.hold("l1")
-    settle(pad)
-    drive(pad, node, (EV_REL, REL["REL_Y"], -350), (EV_KEY, LEFT, 1))
-    assert (pad.state().axis("push_x"), deadman.held) == (1.0, True)
-    system.unplug(node)
-    pad.poll_once(time.monotonic())
-    assert (pad.state().connected, pad.state().axis("push_x"), deadman.held) == (False, 0.0, False)
-    again = rel_node(5)
-    again.down = [LEFT]  # not released meanwhile
-    system.put(again, COMPACT)
-    poll_until(pad.driver, lambda reading: reading.connected)
-    settle_end = time.monotonic() + 10.0
-    while pad.waiting_for != ("l1",):
-        assert time.monotonic() < settle_end, pad.waiting_for
-        pad.poll_once(time.monotonic())
-        time.sleep(0.005)
-    drive(pad, again, (EV_REL, REL["REL_Y"], -350))
-    assert not deadman.held
-    drive(pad, again, (EV_KEY, LEFT, 0))
-    drive(pad, again, (EV_KEY, LEFT, 1), (EV_REL, REL["REL_Y"], -350))
-    assert (deadman.held, pad.state().axis("push_x")) == (True, 1.0)
-
-
 def test_mapping_moves_the_tool_in_the_direction_of_the_cap() -> None:
     mapping = load_mapping("spacemouse")
     stamp = hal.Stamp(0.0, 0.0, 1)

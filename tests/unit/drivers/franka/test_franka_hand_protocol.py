@@ -73,28 +73,6 @@ def test_fingers_move_at_the_commanded_speed_up_to_their_limit():
     assert run(fingers, 0.4) is None
 
 
-@pytest.mark.parametrize(
-    ("inner", "outer", "status"), [(0.005, 0.005, HandStatus.SUCCESS), (0.005, 0.0, HandStatus.UNSUCCESSFUL)]
-)
-def test_a_grasp_closes_on_what_is_there_and_is_judged_by_its_width(inner, outer, status):
-    fingers = Fingers(object_width=0.03)
-    assert fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.028, 0.1, 40.0, inner, outer)) is None
-    assert run(fingers, 1.0) is status
-    assert fingers.width == 0.03
-    assert fingers.is_grasped is (status is HandStatus.SUCCESS)
-    assert fingers.force == (40.0 if fingers.is_grasped else 0.0)
-
-
-def test_a_grasp_of_nothing_closes_all_the_way_unless_set_to_end_at_its_width():
-    for ends_at_width, rest in ((False, 0.0), (True, 0.02)):
-        fingers = Fingers()
-        fingers.grasp_ends_at_width = ends_at_width
-        fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.02, 0.1, 40.0, 0.0, 0.0))
-        assert run(fingers, 1.0) is HandStatus.UNSUCCESSFUL
-        assert fingers.width == rest
-        assert not fingers.is_grasped
-
-
 def test_a_second_grasp_lets_go_and_a_second_motion_is_refused():
     fingers = Fingers(object_width=0.03)
     fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))

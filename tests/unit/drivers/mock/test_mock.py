@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from math import exp
 
 import numpy as np
@@ -15,7 +14,7 @@ from hal.clock import LockStepClock, RealClock
 from hal.driver import Setpoint
 from hal.drivers.mock.camera import STEP, MockCamera, read_picture
 from hal.drivers.mock.gamepad import MockPad
-from hal.drivers.mock.robot import FRICTION, INERTIA, KEEP_UP, MockGripper, MockRobot
+from hal.drivers.mock.robot import FRICTION, INERTIA, MockGripper, MockRobot
 from hal.errors import CommandError, ConnectionLost
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 from hal.types import GripperOutcome
@@ -91,17 +90,6 @@ def test_robot_drop(arm: MockRobot) -> None:
     assert taken == [0.0, 1.0, 1.0, 3.0, 4.0, 4.0]
 
 
-def test_robot_freeze(arm: MockRobot) -> None:
-    before = arm.read(0.0)
-    arm.inject(freeze=True)
-    arm.write(at(0.4))
-    assert arm.read(0.01) is before
-    arm.inject(freeze=False)
-    after = arm.read(0.02)
-    assert after.q == (0.4,) * 3, "the arm moved while its readings stood still"
-    assert after.seq == before.seq + 1
-
-
 @pytest.mark.parametrize(
     ("error", "expected"),
     [(0.02, (0.42, 0.42, 0.42)), ((0.0, 0.1, -0.1), (0.4, 0.5, 0.3)), (np.array([0.0, 0.1, -0.1]), (0.4, 0.5, 0.3))],
@@ -114,16 +102,6 @@ def test_robot_following_error(arm: MockRobot, error: object, expected: tuple[fl
     assert (reading.q, reading.q_commanded) == (pytest.approx(expected), (0.4,) * 3)
 
 
-def test_robot_disconnect(arm: MockRobot) -> None:
-    arm.inject(delay_s=0.1)
-    arm.read(0.0)
-    arm.write(at(0.4))
-    arm.inject(disconnect=True)
-    arm.inject(disconnect=False)
-    arm.open()
-    assert arm.read(1.0).q == HERE, "it stopped where it was when the connection broke"
-
-
 @pytest.mark.parametrize("kind", ["nan", "inf", "short"])
 def test_robot_garbage(arm: MockRobot, kind: str) -> None:
     arm.inject(garbage=kind)
@@ -132,22 +110,6 @@ def test_robot_garbage(arm: MockRobot, kind: str) -> None:
     assert all(math.isfinite(x) for x in q) == (kind == "short")
     arm.clear()
     assert arm.read(0.1).q == HERE
-
-
-def test_robot_fault(arm: MockRobot) -> None:
-    arm.read(0.0)
-    arm.write(at(0.4))
-    arm.read(0.01)
-    arm.inject(fault="joint 2 is too hot")
-    arm.write(at(0.5))
-    reading = arm.read(0.02)
-    assert reading.fault.cause == "joint 2 is too hot"
-    assert reading.fault.remedy
-    assert reading.q == reading.q_commanded == (0.4,) * 3, "a faulted arm ignores set-points"
-    arm.recover()
-    arm.write(at(0.5))
-    reading = arm.read(0.03)
-    assert (reading.fault, reading.q) == (None, (0.5,) * 3)
 
 
 def test_robot_reports_injected_forces(arm: MockRobot) -> None:
@@ -204,21 +166,6 @@ def test_gripper_clamps_commands(gripper: MockGripper) -> None:
     assert gripper.read(10.0).width == 0.0
     gripper.move(1.0, 0.1, 10.0)
     assert gripper.read(20.0).width == 0.08
-
-
-def test_gripper_holds_an_object_and_keeps_it_through_stop_and_close(gripper: MockGripper) -> None:
-    gripper.inject(object_width=0.03)
-    gripper.move(0.0, 0.1, 15.0)
-    assert gripper.read(0.1).grasped is False
-    held = gripper.read(1.0)
-    assert (held.width, held.moving, held.grasped, held.force) == (0.03, False, True, 15.0)
-    gripper.stop()
-    assert gripper.read(2.0).grasped is True
-    gripper.close()
-    gripper.open()
-    assert (gripper.read(3.0).width, gripper.read(3.1).grasped) == (0.03, True)
-    gripper.move(0.08, 0.1, 15.0)
-    assert gripper.read(4.0)[3:7] == (0.08, 0.08, False, False)
 
 
 def test_gripper_closes_further_when_the_object_slips_out(gripper: MockGripper) -> None:
@@ -284,14 +231,6 @@ def test_camera_streams_agree_and_the_square_moves(camera: MockCamera) -> None:
     assert lefts[1] == lefts[0] + STEP
 
 
-def test_camera_delivers_only_the_wanted_streams(camera_spec: CameraSpec) -> None:
-    camera = MockCamera(replace(camera_spec, streams=("depth",)))
-    camera.open()
-    frame = camera.grab(0.0)
-    assert frame.depth is not None
-    assert (frame.color, frame.infrared, frame.segmentation) == (None, None, None)
-
-
 def test_camera_in_lock_step_shows_the_present(camera_spec: CameraSpec) -> None:
     time = [2.0]
     camera = MockCamera(camera_spec, LockStepClock(lambda: time[0], lambda t: None))
@@ -349,20 +288,6 @@ def test_camera_faults(camera: MockCamera) -> None:
 # Pad.
 
 
-def test_pad_events_have_the_time_of_their_poll(pad: MockPad) -> None:
-    rest = pad.poll(1.0, 0.0)
-    assert (rest.connected, rest.buttons, rest.t, rest.t_alive) == (True, frozenset(), 0.0, 1.0)
-    pad.press("south", "l1")
-    pad.stick("left_x", -0.5)
-    pressed = pad.poll(2.0, 0.0)
-    assert (pressed.buttons, pressed.axes["left_x"]) == ({"south", "l1"}, -0.5)
-    assert (pressed.t, pressed.t_alive, pressed.seq) == (2.0, 2.0, rest.seq + 1)
-    pad.release("l1")
-    released = pad.poll(3.0, 0.0)
-    assert (released.buttons, released.seq) == ({"south"}, rest.seq + 2)
-    assert pad.poll(4.0, 0.0)[:2] == (3.0, 4.0), "the event keeps its time, the pad is alive"
-
-
 def test_pad_triggers_are_axis_and_button_in_one(pad: MockPad) -> None:
     pad.press("l2")
     assert pad.poll(1.0, 0.0).axes["l2"] == 1.0
@@ -373,17 +298,6 @@ def test_pad_triggers_are_axis_and_button_in_one(pad: MockPad) -> None:
     pad.set(axes={"left_y": 1.0}, buttons=["east"])
     reading = pad.poll(4.0, 0.0)
     assert (reading.buttons, reading.axes["left_y"], reading.axes["r2"]) == ({"east"}, 1.0, 0.0)
-
-
-def test_frozen_pad_keeps_its_buttons_without_proof_of_life(pad: MockPad) -> None:
-    pad.press("l2")
-    pad.poll(1.0, 0.0)
-    pad.inject(freeze=True)
-    pad.release("l2")
-    frozen = pad.poll(2.0, 0.0)
-    assert (frozen.buttons, frozen.t_alive, frozen.connected) == ({"l2"}, 1.0, True)
-    pad.clear()
-    assert pad.poll(3.0, 0.0).buttons == frozenset()
 
 
 @pytest.mark.parametrize(
@@ -421,15 +335,6 @@ def test_torque_turns_a_wheel_with_friction(arm: MockRobot) -> None:
     assert reading.dq == pytest.approx((speed, 0.0, -0.5 * speed), rel=2e-3)
     way = 2.0 / FRICTION * (0.5 - (1.0 - exp(-0.5 * rate)) / rate)
     assert np.subtract(reading.q, HERE) == pytest.approx((way, 0.0, -0.5 * way), rel=5e-3)
-
-
-def test_arm_stops_when_torques_stop_coming(arm: MockRobot) -> None:
-    drive(arm, (2.0, 0.0, 0.0), 100)
-    speeds = [arm.read((100 + k) * DT).dq[0] for k in range(60)]
-    kept_up = round(KEEP_UP / DT)
-    assert all(speed > 0.0 for speed in speeds[: kept_up - 1])
-    assert speeds[kept_up - 1] > speeds[0]
-    assert (speeds[kept_up + 3 :], arm.read(0.2).q) == ([0.0] * (60 - kept_up - 3), arm.read(0.3).q)
 
 
 def test_dropped_torque_repeats_the_one_before(arm: MockRobot) -> None:

@@ -12,9 +12,8 @@ from hal.drivers.ur.settings import check_arm
 from hal.errors import ConfigError
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
-from hal.specs import RobotSpec
 from hal.testing import robot_spec
-from hal_emulators.ur.motion import forward
+from hal_emulators.ur.motion import ROBOTS, forward, parameters
 
 
 def problems(rate_hz: float = 500.0, joints: int = 6, **options: Any) -> set[str]:
@@ -32,18 +31,21 @@ def test_mistakes_are_named_by_their_key() -> None:
     assert problems(rate_hz=1000.0) == {"rate_hz"}
 
 
-def load_ur5e() -> RobotSpec:
+@pytest.mark.parametrize("model", ROBOTS)
+def test_the_models_flange_is_where_the_dh_parameters_of_ur_put_it(model: str) -> None:
+    arm = {"model": model, "real": {"host": "192.168.0.3"}, "gripper": {"enabled": False}}
     try:
-        return load({"robots": {"arm": {"model": "ur5e"}}}).resolve().robots[0]
+        spec = load({"sim": False, "robots": {"arm": arm}}).resolve().robots[0]
     except ConfigError as error:
-        pytest.skip(error.problems[0].message)
-
-
-def test_the_models_flange_is_where_the_dh_parameters_of_ur_put_it() -> None:
-    spec = load_ur5e()
+        if all(problem.code == "missing_package" for problem in error.problems):
+            pytest.skip(error.problems[0].message)
+        raise
+    assert spec.rate_hz == ROBOTS[model][2]
     kinematics = Kinematics(spec.kinematics)
     tcp = Pose(spec.kinematics.tcp_position, spec.kinematics.tcp_orientation)
+    dh = parameters(model)
     half_turn = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))  # from the controller's base to that of the model
+    beside = (0.1, 0.05, 0.2)  # of the flange: its turn counts, too
     for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 6)):
-        flange = half_turn @ kinematics.pose(q) @ tcp.inverse()
-        assert flange.position == pytest.approx(forward("ur5e", q, [0.0] * 6)[:3], abs=1e-6)
+        point = half_turn @ kinematics.pose(q) @ tcp.inverse() @ Pose(beside)
+        assert point.position == pytest.approx(forward(dh, q, [*beside, 0.0, 0.0, 0.0])[:3], abs=1e-6)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from pictures_kit import COLLADA
 from specs import data, panda
 
 from hal.config.data_files import find_data
@@ -81,14 +80,6 @@ def test_meshes_that_are_not_installed_are_drawn_by_the_collision_shapes(tmp_pat
     assert [visual.kind for visual in drawn["panda_link1"]] == ["cylinder", "cylinder"]
     (note,) = notes
     assert "no_such_package" in note
-
-
-def test_collada_file_keeps_its_units_and_colours(tmp_path: Path) -> None:
-    part = tmp_path / "part.dae"
-    part.write_text(COLLADA)
-    scene = loaded(shape("mesh", (1.0, 1.0, 1.0), str(part)))
-    assert scene.extents == pytest.approx([0.02, 0.02, 0.06])
-    assert (colors(scene) == (255, 0, 0)).all()
 
 
 def test_few_large_triangles_keep_their_texture() -> None:

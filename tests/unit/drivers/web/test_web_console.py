@@ -27,7 +27,7 @@ from hal.host.records import GroupMemory, ServoRecord
 from hal.pads.keyboard import keyboard_table
 from hal.servo.watchdog import PAD_SILENCE
 from hal.types import BUTTONS, STICK_AXES, Limited, RobotStatus, Trip
-from hal.views import ACTIONS, PHASES, RecordingView
+from hal.views import RecordingView
 
 
 def test_the_page_names_the_keys_of_the_table() -> None:
@@ -127,11 +127,6 @@ def test_numbers_may_be_numpy_scalars() -> None:
 def test_texts_become_one_line_of_limited_length() -> None:
     message = recording_message(replace(VIEW, prompt="two\nlines  of it", trouble="no space left " * 1000))
     assert (message["prompt"], len(message["trouble"])) == ("two lines of it", 300)
-
-
-@pytest.mark.parametrize("phase", PHASES)
-def test_every_phase(phase: str) -> None:
-    assert replace(VIEW, phase=phase, actions=ACTIONS).phase == phase
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--robot", choices=sorted(ROBOTS), default="ur5e", help="which arm; ur5 is a CB3 (%(default)s)")
+    add("--robot", choices=sorted(ROBOTS), default="ur5e", help="which arm; ur3, ur5, ur10 are CB3 (%(default)s)")
     add("--host", default="127.0.0.1", type=_loopback, help="address to listen on; the ports are fixed (%(default)s)")
     add("--q", type=float, nargs=6, default=HOME, metavar="RAD", help="joint positions at the start")
     add("--payload", type=float, default=0.0, metavar="KG", help="payload of the installation")
@@ -42,13 +42,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="M",
         help="tcp of the installation: m, rotation vector",
     )
+    add("--calibrated", action="store_true", help="lengths and angles off from the nominal ones, drawn by the seed")
     add(
         "--config",
         metavar="RIG",
         help="put the arm into the simulated world of this rig, whose objects its gripper meets (a name, or a path)",
     )
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
-    add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
+    add("--seed", type=int, default=0, help="seed of random losses, and of a calibration (%(default)s)")
     options = parser.parse_args(arguments)
     try:
         with contextlib.ExitStack() as stack:
@@ -63,6 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _serve(options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
     ends = note_signals()
     controller = Controller(options.robot, options.q, options.payload, options.tcp)
+    if options.calibrated:
+        controller.calibrate(options.seed)
     server = UrServer(options.host, controller, options.seed)
     stack.callback(server.close)
     if options.config is not None:

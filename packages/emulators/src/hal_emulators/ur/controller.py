@@ -7,11 +7,14 @@ the handshake is played.
 from __future__ import annotations
 
 import re
+import struct
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from .motion import ROBOTS, TargetMotion, forward
+import numpy as np
+
+from .motion import ROBOTS, TargetMotion, forward, parameters
 
 __all__ = ["POWER_OFF", "RUNNING", "Controller"]
 
@@ -36,8 +39,8 @@ class Controller:
     """One controller with its arm. ``step`` lets a cycle pass."""
 
     def __init__(self, robot: str, q: Sequence[float], payload: float, tcp: Sequence[float]) -> None:
-        self.robot = robot
-        self.rate = ROBOTS[robot][2][0]
+        self.robot, self.dh = robot, parameters(robot)
+        self.rate = ROBOTS[robot][2]
         self.dt = 1.0 / self.rate
         self.motion = TargetMotion(q, self.dt)
         self.version = (5, 15, 0, 0) if self.rate == 500 else (3, 15, 0, 0)
@@ -98,6 +101,15 @@ class Controller:
         self.inputs.update(values)
         if f"input_int_register_{self.offset}" in values:
             self._t_written = self.now
+
+    def calibrate(self, seed: int) -> None:
+        """Have other lengths and angles, as a factory calibration finds them: how large they are is chosen."""
+        spread = np.array([5e-4, 3e-4, 3e-4, 5e-4])[:, None]
+        self.dh = parameters(self.robot) + np.random.default_rng(seed).normal(0.0, spread, (4, 6))
+
+    def pack_kinematics(self) -> bytes:
+        """Return the message of the primary interface with the kinematics, whose checksums are 0 here."""
+        return struct.pack(">iBiB6I24dI", 230, 16, 225, 5, *[0] * 6, *self.dh.flat, 0)
 
     # Safety.
 
@@ -278,8 +290,8 @@ class Controller:
             "target_qdd": motion.ddq,
             "actual_q": motion.actual_q,
             "actual_qd": motion.actual_dq,
-            "actual_TCP_pose": forward(self.robot, motion.actual_q, self.tcp),
-            "target_TCP_pose": forward(self.robot, motion.q, self.tcp),
+            "actual_TCP_pose": forward(self.dh, motion.actual_q, self.tcp),
+            "target_TCP_pose": forward(self.dh, motion.q, self.tcp),
             "actual_TCP_force": self.force,
             "robot_mode": self.robot_mode,
             "safety_mode": self.safety_mode,

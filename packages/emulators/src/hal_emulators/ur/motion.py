@@ -12,19 +12,23 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["ROBOTS", "TargetMotion", "forward"]
+__all__ = ["ROBOTS", "TargetMotion", "forward", "parameters"]
 
 Floats = list[float]
 Vector = np.ndarray[Any, np.dtype[np.float64]]
 
 ROBOTS = {
-    "ur3e": ((-0.24355, -0.2132), (0.15185, 0.13105, 0.08535, 0.0921), (500, 3.0)),
-    "ur5e": ((-0.425, -0.3922), (0.1625, 0.1333, 0.0997, 0.0996), (500, 5.0)),
-    "ur10e": ((-0.6127, -0.57155), (0.1807, 0.17415, 0.11985, 0.11655), (500, 12.5)),
-    "ur5": ((-0.425, -0.39225), (0.089159, 0.10915, 0.09465, 0.0823), (125, 5.0)),
+    "ur3": ((-0.24365, -0.21325), (0.1519, 0.11235, 0.08535, 0.0819), 125),
+    "ur5": ((-0.425, -0.39225), (0.089159, 0.10915, 0.09465, 0.0823), 125),
+    "ur10": ((-0.612, -0.5723), (0.1273, 0.163941, 0.1157, 0.0922), 125),
+    "ur3e": ((-0.24355, -0.2132), (0.15185, 0.13105, 0.08535, 0.0921), 500),
+    "ur5e": ((-0.425, -0.3922), (0.1625, 0.1333, 0.0997, 0.0996), 500),
+    "ur10e": ((-0.6127, -0.57155), (0.1807, 0.17415, 0.11985, 0.11655), 500),
+    "ur16e": ((-0.4784, -0.36), (0.1807, 0.17415, 0.11985, 0.11655), 500),
+    "ur20": ((-0.862, -0.7287), (0.2363, 0.2010, 0.1593, 0.1543), 500),
 }
-"""Arm -> lengths a2 and a3; d1, d4, d5 and d6, m; rate, Hz, and greatest payload, kg. From UR's article "DH Parameters
-for calculations of kinematics and dynamics"."""
+"""Arm -> lengths a2 and a3; d1, d4, d5 and d6, m; rate, Hz (125: a CB3). From UR's article "DH Parameters for
+calculations of kinematics and dynamics"."""
 
 TOP_SPEED = 3.35
 """Speed above which the arm stops, rad/s: 191 degrees/s, the joints' limit in the safety configuration."""
@@ -34,20 +38,24 @@ _FOLLOWING = 0.004
 """Lag of the arm behind its target, s."""
 
 
-def forward(robot: str, q: Sequence[float], tcp: Sequence[float]) -> Floats:
+def parameters(robot: str) -> Vector:
+    """Return the nominal DH parameters (4, 6) of a key of :data:`ROBOTS`: theta, rad; a and d, m; alpha, rad."""
+    (a2, a3), (d1, d4, d5, d6), _ = ROBOTS[robot]
+    right = math.pi / 2
+    return np.array([[0.0] * 6, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], [right, 0, 0, right, -right, 0]])
+
+
+def forward(dh: Vector, q: Sequence[float], tcp: Sequence[float]) -> Floats:
     """Return the pose of the tcp in the controller's base frame: m, and a rotation vector, rad.
 
     Args:
-        robot: A key of :data:`ROBOTS`.
+        dh: DH parameters, as from :func:`parameters`.
         q: Joint positions (6,), rad.
         tcp: The tcp in the frame of the flange: m, and a rotation vector, rad.
     """
-    (a2, a3), (d1, d4, d5, d6), _ = ROBOTS[robot]
-    right = math.pi / 2
-    rows = ((0.0, d1, right), (a2, 0.0, 0.0), (a3, 0.0, 0.0), (0.0, d4, right), (0.0, d5, -right), (0.0, d6, 0.0))
     pose = np.eye(4)
-    for angle, (a, d, alpha) in zip(q, rows, strict=True):
-        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
+    for angle, offset, a, d, alpha in zip(q, *dh.tolist(), strict=True):
+        c, s, ca, sa = math.cos(angle + offset), math.sin(angle + offset), math.cos(alpha), math.sin(alpha)
         pose = pose @ np.array(
             [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]]
         )

@@ -24,7 +24,7 @@ from .controller import POWER_OFF, RUNNING, Controller
 
 __all__ = ["COMMANDS", "UrServer"]
 
-RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
+RTDE, DASHBOARD, PRIMARY, SCRIPTS = 30004, 29999, 30001, (30001, 30002, 30003)
 _LONGEST = 1 << 20
 """Most bytes that a client may send without a whole message."""
 _FORMATS = {"VECTOR6D": "6d", "DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q"}
@@ -205,6 +205,8 @@ class UrServer:
             self._selector.register(line, selectors.EVENT_READ, client)
             if port == DASHBOARD:
                 self._send(client, b"Connected: Universal Robots Dashboard Server\n")
+            elif port == PRIMARY:
+                self._send(client, self.controller.pack_kinematics())
 
     def _drop(self, client: _Client) -> None:
         if client in self._clients:
@@ -366,7 +368,7 @@ class UrServer:
         old = self.controller
         self._lose = self._delay = self._silent_until = self._cut_until = 0.0
         self.controller = Controller(old.robot, self._home, old.payload, old.tcp)
-        self.controller.cog, self.controller.now = old.cog, old.now
+        self.controller.cog, self.controller.dh, self.controller.now = old.cog, old.dh, old.now
 
     def _describe(self) -> dict[str, Any]:
         controller, motion = self.controller, self.controller.motion
