@@ -144,5 +144,5 @@ def test_it_names_a_model_that_has_no_emulator_and_knows_the_address_of_localhos
     assert arm.arguments == ["xarm", "--robot", "xarm7", "--host", "127.0.0.3", "--config", "xarm7"]
     model = tmp_path / "my_ur16e.yaml"
     model.write_bytes(find_data("robots", "ur5e.yaml").read_bytes())
-    with pytest.raises(ValueError, match=r"arm: .*my_ur16e.* has no emulator, only ur10e, ur3e, ur5, ur5e"):
+    with pytest.raises(ValueError, match=r"arm: .*my_ur16e.* has no emulator, only ur10, ur10e, ur16e"):
         list_emulators("ur5e_robotiq", [f"robots.arm.model={model}"])
