@@ -42,7 +42,10 @@ PROGRAMS = {
 GROUP = "hal.apps"
 """Group of the entry points of programs that other packages have."""
 BESIDE = {
-    "emulate": ("play what a rig names as real: Franka, UR and CAN arms, Robotiq grippers", "packages/emulators"),
+    "emulate": (
+        "play what a rig names as real: Franka, UR, UFACTORY and CAN arms, Robotiq grippers",
+        "packages/emulators",
+    ),
     "import-ark": ("convert a configuration of Ark", "packages/import-ark"),
 }
 """Program of a package beside this one -> what it does, and the package's folder in the repository."""

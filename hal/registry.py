@@ -49,6 +49,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "video": "hal.drivers.webcam:VIDEO",
         "viser": "hal.drivers.viser:DRIVER",
         "web": "hal.drivers.web:DRIVER",
+        "xarm": "hal.drivers.xarm:DRIVER",
     }
 )
 """Name of a built-in driver -> place of its :class:`DriverSpec`, as "module:ATTRIBUTE"."""

@@ -8,20 +8,11 @@ from typing import Annotated
 from pydantic import Field
 
 from hal.config.files import DeviceSettings
-from hal.config.schema import Flag, Host, Mass, Offset, Quantity, Strict
+from hal.config.schema import Flag, Host, Load, Quantity
 from hal.specs import RobotSpec
 
 TOP_SPEED, TOP_ACCELERATION = 3.14, 40.0
 """Limits of ur_rtde for joints, rad/s and rad/s2."""
-
-
-class Load(Strict):
-    """Everything that is mounted on the flange, the gripper included."""
-
-    mass: Mass
-    """kg"""
-    com: Offset = (0.0, 0.0, 0.0)
-    """Centre of mass in the frame of the flange, m."""
 
 
 class UrSettings(DeviceSettings):

@@ -280,6 +280,15 @@ Torques = Annotated[_Any, Several(Quantity("Nm", 0.0, 5000.0, above=True), None,
 _POSE = Several(Quantity("", -50.0, 50.0), 7, "x, y, z in m, then a quaternion x, y, z, w; or {position, orientation}")
 
 
+class Load(Strict):
+    """Everything that is mounted on the flange, the gripper included."""
+
+    mass: Mass
+    """kg"""
+    com: Offset = (0.0, 0.0, 0.0)
+    """Centre of mass in the frame of the flange, m."""
+
+
 class PoseConfig(Strict):
     """``{position: [x, y, z], orientation: [x, y, z, w]}``, or the same seven numbers as one list. m."""
 

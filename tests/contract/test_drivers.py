@@ -48,6 +48,7 @@ from .pads import mock_pad, playback_pad, terminal_steps, web_pad
 from .robotiqs import robotiq_gripper
 from .urs import Ur
 from .webcams import network_camera, video_file, webcam
+from .xarms import XArm7
 
 NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simulation: there is no link")
 
@@ -173,6 +174,31 @@ class TestEmulatedUr10e(
     ):
         assert hasattr(RobotContract, f"test_{_name}")
         vars()[f"test_{_name}"] = None
+
+
+@pytest.fixture(scope="module")
+def xarm7() -> Iterator[XArm7]:
+    """An emulated xArm7."""
+    robot = XArm7()
+    yield robot
+    robot.close()
+
+
+@pytest.mark.slow
+@pytest.mark.alone  # in real time
+class TestEmulatedXarm7(
+    RobotContract,
+    left_out={
+        "freeze": "a controller that is silent for 0.12 s counts as lost: tests/wire/test_xarm_faults.py",
+        "torque": "servo mode takes positions",
+    },
+):
+    """The driver and xarm-python-sdk against the emulator, in real time."""
+
+    @pytest.fixture
+    def bench(self, xarm7: XArm7) -> Iterator[RobotBench]:
+        with xarm7.arm() as bench:
+            yield bench
 
 
 # Grippers.

@@ -47,7 +47,7 @@ def with_real_drivers(config: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", list_data("config"))
 def test_every_built_in_rig_is_valid(name: str) -> None:
-    if name == "baxter_table" and package_folder("example_robot_data") is None:
+    if name in ("baxter_table", "xarm7") and package_folder("example_robot_data") is None:
         pytest.skip("needs the package example_robot_data")
     rig = plan(name)
     assert rig.robots

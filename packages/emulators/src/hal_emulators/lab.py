@@ -68,7 +68,7 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
         return Emulator("can", ["can", *words])
     if driver == "robotiq":
         return Emulator("robotiq", ["robotiq", *words])
-    if arm.driver != driver or driver not in ("franka", "ur"):
+    if arm.driver != driver or driver not in ("franka", "ur", "xarm"):
         return None
     options = ["--host", find_address(arm), *(words if in_world else [])]
     if driver == "ur":
@@ -76,6 +76,8 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
             known = ", ".join(sorted(ROBOTS))
             raise ValueError(f"{arm.name}: its model {arm.model} has no emulator, only {known}")
         return Emulator(arm.name, ["ur", "--robot", arm.model, *options])
+    if driver == "xarm":
+        return Emulator(arm.name, ["xarm", "--robot", f"xarm{len(arm.joints)}", *options])
     bare = arm.gripper is None or arm.gripper.driver != driver
     hand = ["--end-effector", "none", "--no-hand"] if bare else []
     return Emulator(arm.name, ["franka", "--robot", _FRANKA[arm.options["arm"]], *hand, *options])

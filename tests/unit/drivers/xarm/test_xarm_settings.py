@@ -1,0 +1,69 @@
+"""The ``real:`` part of a UFACTORY arm, and its model against UFACTORY's own figures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hal.config import load
+from hal.drivers.xarm.settings import check_arm
+from hal.errors import ConfigError
+from hal.geometry import Pose
+from hal.kinematics.arm import Kinematics
+from hal.specs import RobotSpec
+from hal.testing import robot_spec
+from hal_emulators.xarm.controller import ROBOTS, Controller
+
+
+def problems(rate_hz: float = 250.0, joints: int = 7, tcp_speed: float = 0.25, **options: Any) -> set[str]:
+    spec = robot_spec(joints, driver="xarm", rate_hz=rate_hz, options={"host": "192.168.1.200"} | options)
+    return {key for key, _, _ in check_arm(replace(spec, tcp_speed=tcp_speed))}
+
+
+def test_mistakes_are_named_by_their_key() -> None:
+    assert problems(load={"mass": 1.5, "com": [0, 0, 0.05]}) == set()
+    assert problems(joints=6, rate_hz=100.0) == set()
+    assert problems(host=None) == {"real.host"}
+    assert problems(load={"mass": -1}) == {"real.load.mass"}
+    assert problems(joints=4) == {"model"}
+    assert problems(rate_hz=500.0) == {"rate_hz"}
+    assert problems(tcp_speed=1.2) == {"tcp_speed"}
+
+
+def load_xarm7() -> RobotSpec:
+    try:
+        return load({"robots": {"arm": {"model": "xarm7"}}}).resolve().robots[0]
+    except ConfigError as error:
+        pytest.skip(error.problems[0].message)
+
+
+def test_the_models_flange_is_where_the_dh_parameters_of_ufactory_put_it() -> None:
+    spec = load_xarm7()
+    kinematics, controller = Kinematics(spec.kinematics), Controller("xarm7", [0.0] * 7)
+    for q in np.random.default_rng(0).uniform(-1.5, 1.5, (20, 7)):
+        x = controller.forward(q)
+        distance, turn = Pose.from_rpy([1e-3 * value for value in x[:3]], x[3:]).distance(kinematics.pose(q))
+        assert distance < 1e-5
+        assert turn < 1e-4
+
+
+def test_narrower_limits_of_a_newer_arm_are_named() -> None:
+    pytest.importorskip("xarm", reason="needs xarm-python-sdk: pip install 'robot-hal[xarm]'")
+    from hal.drivers.xarm.preflight import check_limits
+
+    spec = load_xarm7()
+    assert check_limits(spec, 7, 7, "XI130412345678").level == "ok"
+    newer = check_limits(spec, 7, 7, "XI130512345678")
+    assert newer.level == "warn"
+    assert "joint2 -2.042 to 2.025 rad, joint4 -0.105 to 3.927 rad" in newer.found
+    assert check_limits(spec, 7, 99, None).level == "unknown"
+
+
+def test_the_models_limits_are_those_of_the_sdk() -> None:
+    limits = load_xarm7().limits
+    for low, high, (least, most) in zip(limits.lower, limits.upper, ROBOTS["xarm7"].limits, strict=True):
+        assert least - 1e-5 <= low
+        assert high <= most + 1e-5

@@ -1,0 +1,147 @@
+"""An emulated UFACTORY arm with the unmodified xarm-python-sdk: in a program of its own, and behind hal.open."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hal
+
+from .test_ur_faults import recover
+from .test_ur_rig import find_children
+from .xarm_kit import XArmEmulator
+
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
+
+APP = """
+import sys, hal, json
+with hal.open(json.loads(sys.argv[1])) as rig, rig.robots["arm"].control(rate_hz=50, unattended=True) as control:
+    for tick in rig.clock.rate(50):
+        control.send(hal.JointVelocity([0, 0, 0, 0.1, 0, 0, 0]))
+"""
+
+
+@pytest.fixture
+def emulator() -> Iterator[XArmEmulator]:
+    emulator = XArmEmulator()
+    yield emulator
+    emulator.close()
+
+
+def test_a_program_of_its_own_moves_the_arm_with_the_sdk(emulator: XArmEmulator) -> None:
+    command = [sys.executable, str(Path(__file__).with_name("xarm_client.py")), emulator.host]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 0, ended.stderr
+    done: dict[str, Any] = json.loads(ended.stdout.splitlines()[-1])
+    assert done["arm"] == [7, [2, 5, 0]]
+    assert [done["not enabled"], done["wrong mode"]] == [9, 10], "not ready; not possible in this mode"
+    assert done["start"] == [0, 0, 0, 2]
+    assert done["move"] == [0]
+    assert done["moved"] == pytest.approx([0, 0, 0, 0, 0, 0, 0.4], abs=1e-3)
+    assert done["servo"] == [0, 0, 0, 2]
+    assert done["streamed"] == pytest.approx([0, 0, 0, 0, 0, 0.1, 0], abs=1e-3)
+    assert done["jump"] == [1, 24, 4]
+    assert abs(done["still"]) < 0.01, "it does not follow a jump"
+    assert done["clean"] == [0, 0, 0, 0, 0, 2, 0]
+    assert done["report"] == [1, 0, [1] * 7]
+    assert done["load"] == 0
+
+
+def drive(rig: hal.Rig, emulator: XArmEmulator, act: Any) -> None:
+    """Move until the session ends; ``act`` once the arm moves."""
+    with pytest.raises(hal.HalError), rig.robots["arm"].control(rate_hz=50, unattended=True) as control:
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointVelocity([0, 0, 0, 0.2, 0, 0, 0]))
+            if act is not None and max(emulator.status()["dq"]) > 0.15:
+                act = act()
+            assert tick.elapsed < 10.0
+
+
+def check_stands(emulator: XArmEmulator) -> None:
+    """Check that the arm comes to rest and stays there without an error, with its motors on."""
+    rest = emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 0.3)
+    time.sleep(0.3)
+    status = emulator.status()
+    assert status["q"] == pytest.approx(rest["q"], abs=1e-4)
+    assert status["q"] == pytest.approx(status["target_q"], abs=1e-4)
+    assert [status["error"], status["enabled"]] == [0, True]
+
+
+def test_the_arm_stands_at_its_last_set_point_when_the_host_is_killed(emulator: XArmEmulator) -> None:
+    before = find_children()
+    with hal.open(emulator.rig()) as rig:
+        (host,) = find_children() - before
+        drive(rig, emulator, lambda: os.kill(host, signal.SIGKILL))
+        check_stands(emulator)
+    with hal.open(emulator.rig()) as rig:  # and it can be driven again
+        arm = rig.robots["arm"]
+        assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
+
+
+def test_the_arm_stands_while_the_host_is_frozen_and_continues_without_a_jump(emulator: XArmEmulator) -> None:
+    before = find_children()
+    with hal.open(emulator.rig()) as rig:
+        (host,) = find_children() - before
+
+        def freeze() -> None:
+            os.kill(host, signal.SIGSTOP)
+            time.sleep(0.15)
+            assert max(map(abs, emulator.status()["dq"])) < 1e-3
+            time.sleep(0.15)
+            os.kill(host, signal.SIGCONT)
+
+        drive(rig, emulator, freeze)
+        check_stands(emulator)
+        arm = rig.robots["arm"]
+        recover(rig, arm)
+        assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
+    assert not any("error" in event for event in emulator.status()["events"])
+
+
+def test_the_arm_stands_when_the_app_is_killed(emulator: XArmEmulator) -> None:
+    with subprocess.Popen([sys.executable, "-c", APP, json.dumps(emulator.rig())]) as app:
+        emulator.wait_for(lambda status: max(status["dq"]) > 0.05, 30.0)
+        app.kill()
+    emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 1.0)
+    emulator.wait_for(lambda status: status["state"] == 4, 20.0)
+    check_stands(emulator)
+
+
+def test_the_same_program_ends_at_the_same_poses_on_the_arm_and_in_simulation(emulator: XArmEmulator) -> None:
+    def run(rig: hal.Rig) -> list[Any]:
+        arm, found = rig.robots["arm"], []
+        for change in ([0.2, -0.1, 0.1, 0.1, 0, 0.3, 0], [-0.2, 0.1, -0.2, 0.2, 0.1, 0, 0.3], [0.0] * 7):
+            arm.move_to(arm.home + change, unattended=True, speed=0.3)
+            rig.clock.sleep(0.3)
+            found.append(arm.state())
+        return found
+
+    with hal.open(emulator.rig()) as rig:
+        real = run(rig)
+    with hal.open(emulator.rig(), sim=True, clock="lock_step") as rig:
+        simulated = run(rig)
+    off = max(float(np.abs(a.q - b.q).max()) for a, b in zip(real, simulated, strict=True))
+    apart = max(a.tcp.distance(b.tcp)[0] for a, b in zip(real, simulated, strict=True))
+    print(f"{1e3 * apart:.3f} mm, {off:.5f} rad")
+    assert off < 0.003
+    assert apart < 0.001
+
+
+def test_a_model_of_another_arm_is_refused() -> None:
+    other = XArmEmulator("--robot", "xarm6")
+    try:
+        with pytest.raises(hal.ConnectionLost) as refused:
+            hal.open(other.rig())
+        assert refused.value.code == "WRONG_ARM"
+    finally:
+        other.close()
