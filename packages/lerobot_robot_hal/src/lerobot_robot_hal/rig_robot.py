@@ -17,9 +17,10 @@ from hal.commands import FIRST_STEP_ANGLE, JointTarget
 from hal.config import load
 from hal.config.mapping import load_mapping
 from hal.deadman import Deadman
-from hal.errors import CommandError, DeviceNotFound, MotionStopped, Unreachable
+from hal.errors import CommandError, DeviceNotFound, MotionStopped, StaleStateError, Unreachable
 from hal.gamepad import Gamepad
 from hal.geometry import Pose, apply_rotation
+from hal.observation import Observation
 from hal.robot import Robot
 from hal.specs import RobotSpec
 from hal.teleop import Teleop
@@ -31,8 +32,12 @@ GRIPPER = "gripper"
 """Name of a gripper's number, as in recordings."""
 PATIENCE = 60.0
 """Longest wait for the dead-man, s."""
+OBSERVED = 1.0
+"""Longest wait for an observation, s."""
 LEAD = (0.03, 0.12)
 """Distance by which the goal of a pad may be ahead of the set-point, m and rad."""
+LONGEST_STEP = 0.1
+"""Longest time for which a pad's velocity moves the goal at once, s."""
 _POLL = 0.005
 """Time between two looks at the dead-man and the servo, s."""
 _log = logging.getLogger("lerobot_robot_hal")
@@ -54,8 +59,8 @@ class RigOptions:
     """Names of the arms; None for all."""
     camera_names: list[str] | None = None
     """Names of the observed cameras; None for all that have colour."""
-    rate_hz: float = 30.0
-    """Rate at which actions come, Hz: 2.5 periods without one, at least 0.1 s, bring the arms to rest."""
+    rate_hz: float = 10.0
+    """Lowest rate of actions, Hz: the arms come to rest if none comes for 2.5 periods, at least 0.1 s."""
     pad: str = "auto"
     """Gamepad of the dead-man and of ``--teleop.type=hal``, as ``hal --pad``: auto, web, evdev, demo or a recording."""
     console: bool = False
@@ -167,10 +172,10 @@ class RigRobot:
             mapping = (teleop and teleop.mapping) or pad.mapping or "default"
             control = load_mapping(mapping).deadman
             self._deadman = pad.hold(control)
-            _log.warning("hold %s of %s to move", pad.control_name(control), pad.describe())
+            _log.warning("release %s of %s, then hold it to move", pad.control_name(control), pad.describe())
             if teleop is not None:
                 robot = _find({arm.robot.name: arm.robot for arm in arms}, teleop.arm or arms[0].robot.name, "arm")
-                self.teleop = PadTargets(robot, pad, mapping, 1.0 / self.options.rate_hz)
+                self.teleop = PadTargets(robot, pad, mapping)
         self.rig, self._arms = rig, arms
 
     def close(self) -> None:
@@ -191,8 +196,13 @@ class RigRobot:
     # Observations and actions.
 
     def observe(self) -> dict[str, Any]:
-        """Return the newest pictures, with the positions of all joints and grippers at the time of the newest."""
-        seen = self._require_open().observe(cameras=list(self.cameras))
+        """Return the newest pictures, with the positions of all joints and grippers at the time of the newest.
+
+        Raises:
+            StaleStateError: A picture or a state did not come for :data:`OBSERVED`.
+            ConnectionLost: A device does not answer.
+        """
+        seen = self._observe_rig()
         found: dict[str, Any] = {}
         for arm in self._arms:
             values = seen.robots[arm.robot.name].q.tolist()
@@ -200,6 +210,17 @@ class RigRobot:
                 values.append(seen.grippers[arm.robot.name].width)
             found.update(zip(arm.names, values, strict=True))
         return found | {name: np.array(moment.frame.color) for name, moment in seen.cameras.items()}
+
+    def _observe_rig(self) -> Observation:
+        """Observe the rig; on a busy computer a state may come late, and ends no recording."""
+        rig = self._require_open()
+        end = rig.clock.now() + OBSERVED
+        while True:
+            try:
+                return rig.observe(cameras=list(self.cameras))
+            except StaleStateError:
+                if rig.clock.now() > end:
+                    raise
 
     def read_pad(self) -> dict[str, float]:
         """Return the action that the pad wants; the other arms stay where they are."""
@@ -241,9 +262,7 @@ class RigRobot:
     def _set_points(self) -> dict[str, float]:
         found: dict[str, float] = {}
         for arm in self._arms:
-            gripper = arm.robot.gripper
-            state = gripper.peek() if gripper is not None else None
-            found.update(arm.join(arm.robot.state().q_set, None if state is None else state.width_target))
+            found.update(arm.join(arm.robot.state().q_set, _read_target(arm.robot)))
         return found
 
     # Control sessions.
@@ -265,7 +284,6 @@ class RigRobot:
                 again = "" if self._deadman is None else "; release the dead-man, then hold it again"
                 _log.warning("no action came in time: the arms came to rest%s", again)
                 self._close_sessions()
-                continue
             if self.teleop is not None:
                 return False
             if rig.clock.now() > end:
@@ -310,9 +328,8 @@ class _Arm:
         return numbers[:-1], min(max(float(numbers[-1]), 0.0), gripper.width_max)
 
     def join(self, q: Array, width: float | None) -> dict[str, float]:
-        """Return the numbers of an action; a gripper whose width is unknown is closed."""
-        widths = [] if self.robot.gripper is None else [width or 0.0]
-        return dict(zip(self.names, [*q.tolist(), *widths], strict=True))
+        """Return the numbers of an action: joint positions (n,), rad, and the width of a gripper, m."""
+        return dict(zip(self.names, [*q.tolist(), *([] if width is None else [width])], strict=True))
 
     def clip(self, q: Array) -> Array:
         """Return joint positions within the limits, rad."""
@@ -327,11 +344,12 @@ class PadTargets:
         robot: The arm.
         pad: The pad.
         mapping: Name or file of the mapping.
-        period: Time between two calls of :meth:`read`, s.
     """
 
-    def __init__(self, robot: Robot, pad: Gamepad, mapping: str, period: float) -> None:
-        self.robot, self.pad, self.period = robot, pad, period
+    def __init__(self, robot: Robot, pad: Gamepad, mapping: str) -> None:
+        self.robot, self.pad = robot, pad
+        self._t = -np.inf
+        """Time of the last call, s."""
         self._teleop = Teleop(robot, mapping)
         self._goal = Pose()
         self._q: Array | None = None
@@ -345,29 +363,28 @@ class PadTargets:
         Args:
             follows: Whether the arm follows; else its set-point is returned.
         """
-        state, gripper = self.robot.state(), self.robot.gripper
-        motion, grip = self._teleop.step(self.pad.state(), self.period)
-        if gripper is not None:
-            seen = gripper.peek()
-            if grip is not None:
-                self._width = gripper.width_of(grip)
-            elif self._width is None and seen is not None:
-                self._width = seen.width_target
+        state, gripper, now = self.robot.state(), self.robot.gripper, self.robot.clock.now()
+        if self._width is None:
+            self._width = _read_target(self.robot)
+        self._t, dt = now, min(now - self._t, LONGEST_STEP)
+        motion, grip = self._teleop.step(self.pad.state(), dt)
+        if gripper is not None and grip is not None:
+            self._width = gripper.width_of(grip)
         if not follows or self._q is None:
             self._goal, self._q = state.tcp_set, np.array(state.q_set)
         if follows and (motion.linear.any() or motion.angular.any()):
-            self._move(motion, state.tcp_set)
+            self._move(motion, dt, state.tcp_set)
         return self._q, self._width
 
-    def _move(self, motion: hal.Twist, reached: Pose) -> None:
+    def _move(self, motion: hal.Twist, dt: float, reached: Pose) -> None:
         """Move the goal on, unless the arm is too far behind or does not reach it."""
         assert self._q is not None
         linear, angular = motion.linear, motion.angular
         if motion.frame == "tcp":
             axes = Pose(orientation=self._goal.orientation)
             linear, angular = axes.transform(linear), axes.transform(angular)
-        turned = apply_rotation(self._goal.orientation.tolist(), (self.period * angular).tolist())
-        goal = Pose(self._goal.position + self.period * linear, turned)
+        turned = apply_rotation(self._goal.orientation.tolist(), (dt * angular).tolist())
+        goal = Pose(self._goal.position + dt * linear, turned)
         before, after = reached.distance(self._goal), reached.distance(goal)
         if any(ahead > most and ahead > was for ahead, most, was in zip(after, LEAD, before, strict=True)):
             return
@@ -377,6 +394,11 @@ class PadTargets:
             return
         if np.abs(q - self._q).max() <= FIRST_STEP_ANGLE:  # else it is another posture
             self._goal, self._q = goal, q
+
+
+def _read_target(robot: Robot) -> float | None:
+    """Return the last commanded width of an arm's gripper, m; None without one."""
+    return None if robot.gripper is None else robot.gripper.state(np.inf).width_target
 
 
 def _find(known: Mapping[str, Any], name: str, what: str) -> Any:
