@@ -13,6 +13,7 @@ from lerobot_robot_hal.rig_robot import RigOptions, RigRobot, TeleopOptions
 
 import hal
 from hal.errors import CommandError, DeviceNotFound, MotionStopped
+from hal.types import GripperOutcome
 
 PERIOD = 1.0 / 30.0
 Make = Callable[..., RigRobot]
@@ -51,7 +52,10 @@ def test_the_features_are_those_of_the_rig_before_it_is_open() -> None:
 
 def test_the_names_of_several_arms_begin_with_the_arm(make: Make) -> None:
     robot = make(rig="openarm")
-    assert set(robot.action_features) == set(robot.observe())
+    action = robot.observe()
+    assert set(robot.action_features) == set(action)
+    for _ in range(2):
+        assert robot.send(action).keys() == action.keys()
     assert {name.partition(".")[0] for name in robot.action_features} == set(open_rig(robot).robots)
 
 
@@ -84,6 +88,23 @@ def test_after_a_pause_the_arm_moves_to_a_target_that_is_far_away(make: Make) ->
     assert abs(robot.observe()["panda_joint1.pos"] - action["panda_joint1.pos"]) < 1e-3
     (group,) = rig.statistics().values()
     assert group["robots"]["panda"]["peak"]["velocity"] <= 0.1 + 1e-6, "as fast as move_to"
+
+
+def test_fingers_keep_what_they_hold_until_another_width_is_asked_for(make: Make) -> None:
+    robot = make()
+    gripper, action = open_rig(robot).robots["panda"].gripper, robot.observe()
+    assert gripper is not None
+
+    def send(width: float) -> float:
+        for _ in range(30):
+            robot.send(action | {"gripper.pos": width})
+            open_rig(robot).clock.sleep(PERIOD)
+        return float(robot.observe()["gripper.pos"])
+
+    send(action["gripper.pos"])
+    assert gripper.state().outcome is GripperOutcome.NONE
+    for width in (0.02, 0.05):
+        assert abs(send(width) - width) < 1e-3
 
 
 def test_a_stop_ends_the_run(make: Make) -> None:

@@ -33,7 +33,19 @@ class _Program:
     teleop: HalTeleoperatorConfig | None = None
 
 
-class HalRobot(Robot):
+class _Calibrated:
+    """What is calibrated and configured by the rig's file."""
+
+    is_calibrated = True
+
+    def calibrate(self) -> None:
+        pass
+
+    def configure(self) -> None:
+        pass
+
+
+class HalRobot(_Calibrated, Robot):
     """The arms, grippers and cameras of a rig."""
 
     config_class = HalRobotConfig
@@ -61,16 +73,6 @@ class HalRobot(Robot):
     def connect(self, calibrate: bool = True) -> None:
         self.inner.connect(_Program.teleop)
 
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def calibrate(self) -> None:
-        pass
-
-    def configure(self) -> None:
-        pass
-
     def get_observation(self) -> dict[str, Any]:
         return self.inner.observe()
 
@@ -81,7 +83,7 @@ class HalRobot(Robot):
         self.inner.close()
 
 
-class HalTeleoperator(Teleoperator):
+class HalTeleoperator(_Calibrated, Teleoperator):
     """The pad, the console or a recorded pad of the robot's rig."""
 
     config_class = HalTeleoperatorConfig
@@ -112,16 +114,6 @@ class HalTeleoperator(Teleoperator):
 
     def connect(self, calibrate: bool = True) -> None:
         self._connected = True
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def calibrate(self) -> None:
-        pass
-
-    def configure(self) -> None:
-        pass
 
     def get_action(self) -> dict[str, Any]:
         return self._robot.inner.read_pad()

@@ -254,7 +254,7 @@ class RigRobot:
         sent: dict[str, float] = {}
         for arm, q, width in targets:
             assert arm.control is not None
-            command = arm.control.send(JointTarget(q), width=width).command
+            command = arm.control.send(JointTarget(q), width=arm.find_change(width)).command
             assert isinstance(command, JointTarget)
             sent.update(arm.join(command.q, width))
         return sent
@@ -279,8 +279,9 @@ class RigRobot:
                 if all(follows):
                     return True
             except MotionStopped as stop:
-                if stop.code != Trip.COMMAND_LATE.code:
-                    raise
+                alone = self._deadman is None and rig.attended and not rig.emulated
+                if stop.code != Trip.COMMAND_LATE.code or alone:
+                    raise  # as in hal rollout, only a person continues the motion of a real arm
                 again = "" if self._deadman is None else "; release the dead-man, then hold it again"
                 _log.warning("no action came in time: the arms came to rest%s", again)
                 self._close_sessions()
@@ -293,11 +294,12 @@ class RigRobot:
 
     def _open_sessions(self, targets: list[tuple[_Arm, Array, float | None]]) -> None:
         terms: dict[str, Any] = {"deadman": self._deadman, "unattended": self.options.unattended}
-        for arm, q, _ in targets:
+        closed = [(arm, q) for arm, q, _ in targets if arm.control is None]
+        for arm, q in closed:
             if np.abs(q - arm.robot.state().q_set).max() > FIRST_STEP_ANGLE:
                 _log.warning("%s moves to its first target", arm.robot.name)
                 arm.robot.move_to(arm.clip(q), patience=PATIENCE, **terms)
-        for arm in self._arms:
+        for arm, _ in closed:
             arm.control = self._sessions.enter_context(arm.robot.control(rate_hz=self.options.rate_hz, **terms))
 
     def _close_sessions(self) -> None:
@@ -314,6 +316,16 @@ class _Arm:
     def __init__(self, robot: Robot, names: list[str]) -> None:
         self.robot, self.names = robot, names
         self.control: hal.Control | None = None
+        self._moves_fingers = False
+
+    def find_change(self, width: float | None) -> float | None:
+        """Return the width to command, m; None until one differs from the last command, so that fingers keep hold."""
+        gripper = self.robot.gripper
+        if gripper is None or width is None:
+            return None
+        change = abs(width - gripper.state(np.inf).width_target)
+        self._moves_fingers = self._moves_fingers or change > 0.005 * gripper.width_max
+        return width if self._moves_fingers else None
 
     def split(self, action: Mapping[str, Any]) -> tuple[Array, float | None]:
         """Return joint positions (n,), rad, and the width of the gripper, m, or None. Raises CommandError."""
