@@ -1,0 +1,36 @@
+"""The base classes of LeRobot: its own where it is installed, else stand-ins, since it is 2 GB and CI has none."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+
+class _Choice:
+    """As draccus.ChoiceRegistry: configurations by name."""
+
+    id: str | None = None
+
+    @classmethod
+    def register_subclass(cls, name: str) -> Any:
+        return lambda subclass: subclass
+
+
+class _Device:
+    def __init__(self, config: Any) -> None:
+        self.id = config.id
+
+
+if find_spec("lerobot") is None:
+    for module, names in {
+        "lerobot": {},
+        "lerobot.robots": {"Robot": _Device, "RobotConfig": type("RobotConfig", (_Choice,), {})},
+        "lerobot.teleoperators": {
+            "Teleoperator": _Device,
+            "TeleoperatorConfig": type("TeleoperatorConfig", (_Choice,), {}),
+        },
+    }.items():
+        sys.modules[module] = ModuleType(module)
+        vars(sys.modules[module]).update(names)
