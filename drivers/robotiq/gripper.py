@@ -42,7 +42,7 @@ class RobotiqGripper(GripperDriver):
     """A 2F-85, 2F-140 or Hand-E (settings: :class:`~.settings.RobotiqSettings`).
 
     Only :meth:`home` activates the gripper, because its fingers then move, and let go of what they hold. Fingers that
-    rest, or hold something, never get a stop: the gripper goes on pressing, also when nobody asks it any more.
+    rest, or hold something, never get a stop: the gripper keeps pressing, also without a connection.
     """
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:

@@ -242,8 +242,7 @@ class Link:
         if self._exchange is None:
             if now < self._t_quiet:
                 return False  # late answers to a repeated question are dropped
-            self._writing = self.pending
-            write = self._writing
+            write = self._writing = self.pending if self._writing is None else None  # a status follows each request
             self._exchange = self._protocol.read(now) if write is None else self._protocol.write(write)
             self._ask(line, next(self._exchange), now)
             return True
@@ -260,7 +259,8 @@ class Link:
         except StopIteration as end:
             self._exchange = None
             if self._repeated:
-                self._repeated, self._t_quiet = False, now + self._answer_time
+                last_answer = now + self._t_sent - self._t_asked
+                self._repeated, self._t_quiet = False, last_answer + self._answer_time / 2.0
             if self._writing is not None and self.pending is self._writing:
                 self.pending = None
             if end.value is None:

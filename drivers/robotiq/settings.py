@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field
 
 from hal.config.files import DeviceSettings
-from hal.config.schema import ValueProblem
+from hal.config.schema import Host, ValueProblem, is_own_host
 from hal.specs import GripperSpec
 
 EMULATED = ".emulated"
@@ -46,7 +45,7 @@ class RobotiqSettings(DeviceSettings):
     model: Literal["2f85", "2f140", "hand_e"]
     port: str | None = None
     """Serial device of the RS-485 adapter."""
-    host: str | None = None
+    host: Host | None = None
     """Address of a UR's controller, with Robotiq's URCap on it."""
     slave: Annotated[int, Field(ge=1, le=247, strict=True)] = 9
     """Modbus address; 9 as delivered."""
@@ -72,9 +71,5 @@ def check_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
 
 def is_emulated(options: Mapping[str, Any]) -> bool:
     """Return whether these options are those of an emulator."""
-    if options.get("port") is not None:
-        return str(options["port"]).endswith(EMULATED)
-    try:
-        return ipaddress.ip_address(str(options.get("host"))).is_loopback
-    except ValueError:
-        return options.get("host") == "localhost"
+    port = options.get("port")
+    return is_own_host(options) if port is None else str(port).endswith(EMULATED)

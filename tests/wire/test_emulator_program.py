@@ -73,7 +73,7 @@ def test_commands_from_the_shell(arm: Emulator) -> None:
     assert (done.returncode, done.stdout) == (0, "{}\n")
     assert arm.control.send("state")["mode"] == "user_stopped"
     done = subprocess.run([*shell, "user-stop", "perhaps"], capture_output=True, text=True, timeout=20)
-    assert (done.returncode, done.stderr) == (1, "error: user-stop: takes on or off\n")
+    assert (done.returncode, done.stderr) == (1, "error: user-stop: takes on or off, not 'perhaps'\n")
     done = subprocess.run([*shell, "help"], capture_output=True, text=True, timeout=20)
     assert "silence S" in done.stdout
 

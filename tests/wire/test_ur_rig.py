@@ -148,6 +148,7 @@ def test_a_lost_state_now_and_then_stops_nothing(emulator: UrEmulator) -> None:
         arm = rig.robots["arm"]
         assert abs(arm.move_to(arm.home + 0.2, unattended=True, speed=0.3).q - arm.home - 0.2).max() < 2e-3
         assert arm.state(max_age=inf).fault is None
+        assert emulator.status()["lost"] > 20
 
 
 def test_a_cb3_is_driven_at_125_hz(tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
+import signal
 import socket
 import sys
 import threading
@@ -12,6 +14,30 @@ from typing import Any
 
 CONTROL_PORT = 1339
 """TCP port of a Franka's emulator; that of emulated buses is a free one, which it prints."""
+
+
+def add_rig_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of an emulator that plays every device of its kind in a rig."""
+    parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
+    parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
+    parser.add_argument(
+        "--no-world",
+        action="store_true",
+        help="leave out the rig's simulated world: the fingers meet only what the command `object` names",
+    )
+
+
+def note_signals() -> list[int]:
+    """Return a list to which the signals that ask this program to end are appended.
+
+    It is no Event: a second signal within its ``set`` would wait for ever.
+    """
+    ends: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _: ends.append(number))
+    return ends
 
 
 class EmulatorControl:
@@ -72,7 +98,7 @@ def serve_prompt(execute: Execute) -> None:
         with contextlib.suppress(OSError, ValueError):
             for line in sys.stdin:
                 if line.strip():
-                    answer = _answer(execute, line)
+                    answer = answer_line(execute, line)
                     report = {key: value for key, value in answer.items() if key != "ok"}
                     print(
                         answer.get("text") or answer.get("error") or (json.dumps(report) if report else "ok"),
@@ -105,15 +131,34 @@ class CommandPort:
     def _serve(self, connection: socket.socket) -> None:
         with contextlib.suppress(OSError), connection, connection.makefile("r", encoding="utf-8") as lines:
             for line in lines:
-                connection.sendall(json.dumps(_answer(self._execute, line)).encode() + b"\n")
+                connection.sendall(json.dumps(answer_line(self._execute, line)).encode() + b"\n")
 
     def close(self) -> None:
         """Close the port."""
         self._listener.close()
 
 
-def _answer(execute: Execute, line: str) -> dict[str, Any]:
+def answer_line(execute: Execute, line: str) -> dict[str, Any]:
+    """Execute a line, and return its answer with ``ok``, and ``error`` where that is false."""
     try:
         return {"ok": True, **execute(line)}
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, IndexError) as error:
         return {"ok": False, "error": str(error)}
+
+
+def read_switch(word: str) -> bool:
+    """Return whether a word is on. Raises ValueError unless it is on or off."""
+    if word not in ("on", "off"):
+        raise ValueError(f"takes on or off, not {word!r}")
+    return word == "on"
+
+
+def read_words(line: str) -> list[str]:
+    """Return the words of a line, which may also be ``{"command": [WORD, ...]}``. Raises ValueError."""
+    if not line.startswith("{"):
+        return line.split()
+    message = json.loads(line)
+    words = message.get("command")
+    if not isinstance(words, list) or not words:
+        raise ValueError('expected {"command": ["word", ...]}')
+    return [str(word) for word in words]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from hal.config.loader import load
 from hal.specs import RobotSpec
+from hal_emulators.control import note_signals
 from hal_emulators.shared_world import has_world
 
 _END = 10.0
@@ -84,9 +85,7 @@ def run_lab(config: str, overrides: Sequence[str] = ()) -> int:
     Raises:
         ConfigError, ValueError: As :func:`list_emulators`.
     """
-    ends: list[int] = []  # not an Event: a second signal within its set() would wait for ever
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, _: ends.append(number))
+    ends = note_signals()
     emulators = list_emulators(config, overrides)
     failed = False
     with contextlib.ExitStack() as stack:

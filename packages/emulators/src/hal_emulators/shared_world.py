@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from hal.config.loader import load
 from hal.drivers.scene.shared import Connection, address_of
 from hal.errors import ConnectionLost
+from hal.specs import RobotSpec
 
 PRIORITY = 40
 """Of an emulator among SCHED_FIFO threads; a host has 50."""
@@ -138,21 +139,33 @@ def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
                 process.kill()
 
 
-def enter_world(
-    stack: contextlib.ExitStack, config: str, overrides: Sequence[str], driver: str, host: str
-) -> ArmInWorld:
-    """Return the place of an arm in the simulated world of its rig, which is run until the stack is closed.
-
-    Raises:
-        ConfigError: The rig is not valid.
-        ValueError: It has no arm of this driver at this address, or its world does not start.
-    """
+def find_arm(config: str, overrides: Sequence[str], driver: str, host: str) -> RobotSpec:
+    """Return the arm of a rig that has this driver and address. Raises ConfigError, and ValueError if none has."""
     rig = load(config, sim=False, overrides=overrides).resolve()
     arm = next((arm for arm in rig.robots if arm.driver == driver and arm.options.get("host") == host), None)
     if arm is None:
         raise ValueError(f"{config} has no {driver} at {host}: change --host, or --set robots.NAME.real.host")
+    return arm
+
+
+def enter_world(
+    stack: contextlib.ExitStack, config: str, overrides: Sequence[str], arm: RobotSpec, role: str = "arm"
+) -> ArmInWorld:
+    """Return the place of an arm in the simulated world of its rig, which is run until the stack is closed.
+
+    Args:
+        stack: Closed when the emulator ends.
+        config: The rig.
+        overrides: Changes of it.
+        arm: The arm.
+        role: As for :class:`ArmInWorld`.
+
+    Raises:
+        ConfigError: The rig is not valid.
+        ConnectionLost, ValueError: Its world does not start, or has no such arm.
+    """
     stack.enter_context(run_world(config, overrides))
     raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
-    world = ArmInWorld(address_of(arm), arm.name)
+    world = ArmInWorld(address_of(arm), arm.name, role)
     stack.callback(world.close)
     return world

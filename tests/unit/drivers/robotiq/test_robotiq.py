@@ -303,6 +303,15 @@ def test_a_stop_of_fingers_that_hold_writes_nothing(far: FarGripper, taken: list
     assert far.gripper.force == pytest.approx(100.0, abs=1.0)
 
 
+def test_close_stops_moving_fingers(far: FarGripper) -> None:
+    far.driver.move(0.0, 0.02, 60.0)
+    far.run(0.2)
+    far.driver.close()
+    at = far.gripper.width
+    far.emulator.advance(0.25)
+    assert 0.05 < at == far.gripper.width
+
+
 def test_a_lost_object_is_no_grasp(far: FarGripper) -> None:
     far.execute("object 0.03")
     far.driver.move(0.0, 0.1, 100.0)
@@ -343,6 +352,7 @@ def test_the_line_is_checked_before_it_is_opened() -> None:
 
     assert problems(port="/dev/ttyUSB0") == problems(host="192.168.0.2") == set()
     assert problems() == problems(port="/dev/ttyUSB0", host="192.168.0.2") == {"real.port"}
+    assert problems(host="192.168.0.2:63352") == {"real.host"}
     assert problems(port="a", slave=0) == {"real.slave"}
     assert problems(port="a", counts=[200, 100]) == {"real.counts"}
     assert problems(port="a", model="3f") == {"real.model"}
@@ -369,6 +379,7 @@ def test_the_emulated_line_is_free_after_a_close(far: FarGripper) -> None:
 def test_only_an_emulator_counts_as_emulated() -> None:
     assert is_emulated({"port": "/tmp/robotiq.emulated"})
     assert is_emulated({"host": "127.0.0.2"})
+    assert is_emulated({"host": "localhost."})
     assert not is_emulated({"port": "/dev/pts/3"}), "a pseudo terminal may lead to a real one"
     assert not is_emulated({"host": "192.168.0.2"})
     assert load("franka_robotiq", sim=False, overrides=robotiq_overrides()).resolve().robots[0].emulated

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ except ModuleNotFoundError:
 
 from hal.errors import ControlTaken, HalError
 from hal.lock import DeviceLock
-from hal_emulators.control import CommandPort, serve_prompt
+from hal_emulators.control import CommandPort, add_rig_options, note_signals, serve_prompt
 from hal_emulators.shared_world import has_world, run_world
 
 from .console import help_text
@@ -38,19 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
-    parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
-    parser.add_argument(
-        "--no-world",
-        action="store_true",
-        help="leave out the rig's simulated world: the fingers meet only what the command `object` names",
-    )
+    add_rig_options(parser)
     options = parser.parse_args(arguments)
-    ends: list[int] = []  # not an Event: a second signal within its set() would wait for ever
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, _: ends.append(number))
+    ends = note_signals()
     try:
         _run(options, ends)
     except (HalError, can.CanError, OSError, ValueError) as error:

@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from hal_emulators.control import read_switch
+
 from .server import CanEmulator, EmulatedArm, EmulatedBus
 
 _FOREVER = 1e9
@@ -85,12 +87,6 @@ def _parse_end(word: str) -> float:
         raise ValueError(f"takes a time in s, on or off, not {word!r}") from None
 
 
-def _switch(word: str) -> bool:
-    if word not in ("on", "off"):
-        raise ValueError(f"takes on or off, not {word!r}")
-    return word == "on"
-
-
 # Faults of the bus.
 
 
@@ -111,7 +107,7 @@ def _late(target: _Target, words: list[str]) -> None:
 
 
 def _double(target: _Target, words: list[str]) -> None:
-    target.bus.faults[target.arm.name].copies = 2 if _switch(words[0]) else 1
+    target.bus.faults[target.arm.name].copies = 2 if read_switch(words[0]) else 1
 
 
 def _silent(target: _Target, words: list[str]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import gc
 import ipaddress
-import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from hal.config.data_files import find_data
 from hal.drivers.franka.limits import LIMITS
 from hal.errors import HalError
-from hal_emulators.control import CONTROL_PORT
-from hal_emulators.shared_world import ArmInWorld, enter_world
+from hal_emulators.control import CONTROL_PORT, note_signals
+from hal_emulators.shared_world import ArmInWorld, enter_world, find_arm
 
 from .arm import EmulatedArm, RobotFiles
 from .console import CommandConsole, Executor
@@ -38,20 +37,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
     options = _parser().parse_args(arguments)
     journal = Journal(options.quiet)
+    ends = note_signals()
     try:
         with ExitStack() as stack:
             server, greeting = _prepare(options, stack, journal)
-            for number in (signal.SIGTERM, signal.SIGINT):
-                signal.signal(number, lambda *_: server.stop())
             gc.freeze()
             journal.print(greeting)
-            server.run()
+            server.run(ends)
     except (HalError, OSError, ValueError) as error:
         text = error.strerror if isinstance(error, OSError) and error.strerror else error
         print(f"error: {text}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:  # before it was ready
-        return 130
     journal.print("ended")
     return 0
 
@@ -153,7 +149,8 @@ def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | 
         return None
     if options.unpaced:
         raise ValueError("--config does not go with --unpaced: an app in simulated time has a world of its own")
-    return enter_world(stack, options.config, options.set, "franka", options.host)
+    arm = find_arm(options.config, options.set, "franka", options.host)
+    return enter_world(stack, options.config, options.set, arm)
 
 
 def _address(text: str) -> str:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from hal.drivers.franka.flags import flag_index
-from hal_emulators.control import CONTROL_PORT
+from hal_emulators.control import CONTROL_PORT, answer_line, read_switch, read_words
 
 from .faults import COMMANDS, help_text
 from .journal import Counters
@@ -44,7 +44,7 @@ class CommandConsole:
     def __init__(self, host: str, poller: select.epoll, execute: Execute) -> None:
         """Raises OSError if the port is in use."""
         self._poller = poller
-        self._execute = execute
+        self._execute = lambda line: execute(read_words(line))
         self._listener = listen(host, CONTROL_PORT)
         self._connections: dict[int, socket.socket] = {}
         self._unfinished: dict[int, bytes] = {}
@@ -71,7 +71,7 @@ class CommandConsole:
         try:
             lines = self._lines(descriptor, connection.recv(_MAX_LINE))
             for line in lines:
-                connection.sendall(json.dumps(self._answer(line)).encode() + b"\n")
+                connection.sendall(json.dumps(answer_line(self._execute, line)).encode() + b"\n")
         except (OSError, EOFError):
             self._poller.unregister(connection)
             del self._connections[descriptor]
@@ -88,7 +88,7 @@ class CommandConsole:
             self._stdin = None
             return
         for line in lines:
-            answer = self._answer(line)
+            answer = answer_line(self._execute, line)
             text = answer.get("text") or json.dumps(answer, indent=2)
             with contextlib.suppress(OSError, ValueError):
                 print(text, flush=True)
@@ -102,26 +102,10 @@ class CommandConsole:
         self._unfinished[descriptor] = rest
         return [line.decode(errors="replace").strip() for line in lines if line.strip()]
 
-    def _answer(self, line: str) -> dict[str, Any]:
-        try:
-            return {"ok": True, **self._execute(_words(line))}
-        except (ValueError, TypeError) as error:
-            return {"ok": False, "error": str(error)}
-
     def close(self) -> None:
         """Close the port."""
         for connection in (self._listener, *self._connections.values()):
             connection.close()
-
-
-def _words(line: str) -> list[str]:
-    if not line.startswith("{"):
-        return line.split()
-    message = json.loads(line)
-    words = message.get("command")
-    if not isinstance(words, list) or not words:
-        raise ValueError('expected {"command": ["word", ...]}')
-    return [str(word) for word in words]
 
 
 def _readable_stdin() -> int | None:
@@ -165,9 +149,9 @@ class Executor:
             "unrest": lambda words: server.arm.unrest.set(None if words == ["off"] else int(*_exactly(words, 1))),
             "truncate": self._truncate,
             "reflex": self._reflex,
-            "user-stop": lambda words: server.arm.user_stop(_switch(words)),
-            "emergency-stop": lambda words: server.arm.emergency_stop(_switch(words)),
-            "guiding": lambda words: server.arm.guiding(_switch(words)),
+            "user-stop": lambda words: server.arm.user_stop(read_switch(*_exactly(words, 1))),
+            "emergency-stop": lambda words: server.arm.emergency_stop(read_switch(*_exactly(words, 1))),
+            "guiding": lambda words: server.arm.guiding(read_switch(*_exactly(words, 1))),
             "place": self._place,
             "stall": lambda words: time.sleep(_seconds(words)),
             "slow-reply": self._slow_reply,
@@ -214,7 +198,7 @@ class Executor:
         self._server.arm.reports.noise = float(word)
 
     def _report_measured(self, words: Words) -> None:
-        self._server.arm.reports.measured = _switch(words)
+        self._server.arm.reports.measured = read_switch(*_exactly(words, 1))
 
     def _spoil(self, words: Words) -> None:
         field, value = _exactly(words, 2)
@@ -223,7 +207,7 @@ class Executor:
         self._server.arm.spoil(field, None if value == "off" else float(value))
 
     def _truncate(self, words: Words) -> None:
-        self._server.faults.truncate = _switch(words)
+        self._server.faults.truncate = read_switch(*_exactly(words, 1))
 
     def _reflex(self, words: Words) -> None:
         (name,) = _exactly(words, 1)
@@ -241,7 +225,7 @@ class Executor:
         self._server.faults.slow_reply = _seconds(words)
 
     def _no_move_reply(self, words: Words) -> None:
-        self._server.arm.no_move_reply = _switch(words)
+        self._server.arm.no_move_reply = read_switch(*_exactly(words, 1))
 
     def _version(self, words: Words) -> None:
         (number,) = _exactly(words, 1)
@@ -285,13 +269,6 @@ def _exactly(words: Words, count: int) -> Words:
     if len(words) != count:
         raise ValueError(f"takes {count} argument{'s' if count > 1 else ''}")
     return words
-
-
-def _switch(words: Words) -> bool:
-    (word,) = _exactly(words, 1)
-    if word not in ("on", "off"):
-        raise ValueError("takes on or off")
-    return word == "on"
 
 
 def _seconds(words: Words) -> float:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from hal_emulators.control import answer_line, read_switch, read_words
 from hal_emulators.shared_world import ArmInWorld
 
 from .hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
@@ -74,13 +75,6 @@ class HandFaults:
     """Delay of every answer, s."""
     failures: int = 0
     """Number of motions that fail from now on."""
-
-
-def switch(word: str) -> bool:
-    """Return whether a word is ``on`` rather than ``off``. Raises ValueError for any other."""
-    if word not in ("on", "off"):
-        raise ValueError(f"must be on or off, not {word!r}")
-    return word == "on"
 
 
 def number(word: str, least: float = 0.0, most: float = 1e6) -> float:
@@ -203,16 +197,16 @@ class HandServer:
         self.fingers.put(None if width == "none" else number(width, 1e-6, FULL_WIDTH))
 
     def _do_grasp_ends_at_width(self, word: str) -> None:
-        self.fingers.grasp_ends_at_width = switch(word)
+        self.fingers.grasp_ends_at_width = read_switch(word)
 
     def _do_unhome(self) -> None:
         self.fingers.homed = False
 
     def _do_stop_ignored(self, word: str) -> None:
-        self.faults.stop_ignored = switch(word)
+        self.faults.stop_ignored = read_switch(word)
 
     def _do_stop_releases(self, word: str) -> None:
-        self.faults.stop_releases = switch(word)
+        self.faults.stop_releases = read_switch(word)
 
     def _do_silence(self, seconds: str) -> None:
         self.faults.silent_until = time.monotonic() + number(seconds)
@@ -379,11 +373,7 @@ class _ControlServer(socketserver.ThreadingTCPServer):
 
 
 def _execute(hand: HandServer, line: str) -> dict[str, Any]:
-    try:
-        words = json.loads(line)["command"] if line.lstrip().startswith("{") else line.split()
-        return {"ok": True, **hand.command([str(word) for word in words])}
-    except (ValueError, KeyError, TypeError) as error:
-        return {"ok": False, "error": str(error)}
+    return answer_line(lambda line: hand.command(read_words(line.strip())), line)
 
 
 def main() -> None:

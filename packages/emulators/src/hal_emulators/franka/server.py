@@ -11,7 +11,7 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -201,7 +201,7 @@ _HUNG_PATIENCE = 0.01
 
 
 class ArmServer:
-    """Serves one client at a time on port 1337 of one address, until :meth:`stop`."""
+    """Serves one client at a time on port 1337 of one address."""
 
     def __init__(self, host: str, arm: EmulatedArm, files: RobotFiles, pacing: Pacing, seed: int = 0) -> None:
         """Raises OSError if the port is not available."""
@@ -225,7 +225,7 @@ class ArmServer:
         self._sent_at = 0.0
         self._hung = False
         self._away_until = 0.0
-        self._stopping = False
+        self._ends: Sequence[object] = ()
         self.world: ArmInWorld | None = None
         """The simulated world that the arm is in."""
 
@@ -233,9 +233,10 @@ class ArmServer:
         """Pass descriptors that others registered with :attr:`poller` to ``serve`` once they are ready."""
         self._serve_other = serve
 
-    def run(self) -> None:
-        """Serve until :meth:`stop`."""
-        while not self._stopping:
+    def run(self, ends: Sequence[object]) -> None:
+        """Serve until something is in ``ends``."""
+        self._ends = ends
+        while not ends:
             self._gather()
             packet = self.arm.tick(self._command)
             if self.session is not None and self.session.connected:
@@ -243,10 +244,6 @@ class ArmServer:
             self._flush()
             if self.world is not None:
                 self.world.exchange(DT, self.arm.plant.q)
-
-    def stop(self) -> None:
-        """End the loop soon. Safe in signal handlers."""
-        self._stopping = True
 
     def close(self) -> None:
         """Close every socket."""
@@ -312,7 +309,7 @@ class ArmServer:
                 self._hung = False
                 self.arm.counters.answers.add(time.monotonic() - self._sent_at)
                 return
-            if self.arm.motion is not motion or self._stopping:
+            if self.arm.motion is not motion or self._ends:
                 return
             if left <= 0.0:
                 self._hung = not motion.waiting and self._state_sent

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import signal
 import sys
 import time
 from collections.abc import Sequence
 
 from hal.config.loader import load
-from hal.drivers.scene.shared import address_of
 from hal.errors import HalError
-from hal_emulators.control import CommandPort, serve_prompt
-from hal_emulators.shared_world import PRIORITY, ArmInWorld, has_world, raise_priority, run_world
+from hal_emulators.control import CommandPort, add_rig_options, note_signals, serve_prompt
+from hal_emulators.shared_world import enter_world, has_world
 
 from .server import RobotiqEmulator, find_grippers, help_text
 
@@ -28,29 +26,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
-    parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
-    parser.add_argument(
-        "--no-world",
-        action="store_true",
-        help="leave out the rig's simulated world: the fingers meet only what the command `object` names",
-    )
+    add_rig_options(parser)
     options = parser.parse_args(arguments)
-    ends: list[int] = []  # not an Event: a second signal within its set() would wait for ever
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, _: ends.append(number))
+    ends = note_signals()
     try:
         with contextlib.ExitStack() as stack:
             emulator = RobotiqEmulator(find_grippers(options.config, options.set), options.seed, realtime=True)
             if not options.no_world and has_world(options.config, options.set):
-                stack.enter_context(run_world(options.config, options.set))
                 for robot in load(options.config, sim=False, overrides=options.set).resolve().robots:
                     if robot.name in emulator.ports:
                         emulator.ports[robot.name].gripper.in_world = True
-                        emulator.worlds[robot.name] = ArmInWorld(address_of(robot), robot.name, role="fingers")
-                raise_priority(PRIORITY)
+                        world = enter_world(stack, options.config, options.set, robot, role="fingers")
+                        emulator.worlds[robot.name] = world
             stack.enter_context(emulator)
             control = CommandPort(emulator.execute, options.port)
             places = ", ".join(f"{arm} at {port.gripper.settings.place}" for arm, port in emulator.ports.items())

@@ -6,7 +6,6 @@ with RobotiqEmulator("fr3_robotiq") as emulator:
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import signal
@@ -18,7 +17,8 @@ from typing import Any, NamedTuple
 
 from hal.config.loader import load
 from hal.specs import GripperSpec
-from hal_emulators.shared_world import ArmInWorld
+from hal_emulators.control import read_switch
+from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .gripper import EmulatedGripper
 from .ports import Port, SerialPort, TextPort
@@ -30,8 +30,6 @@ _STEP = 0.002
 _LONGEST_GAP = 0.25
 """Time that the fingers make up for after the machine had no time for them, s."""
 _FOREVER = 1e9
-_PRIORITY = 40
-"""Of the thread of a program among SCHED_FIFO threads: a busy computer must not look like a silent gripper."""
 
 
 def find_grippers(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[GripperSpec]:
@@ -86,8 +84,7 @@ class RobotiqEmulator:
 
     def _serve(self) -> None:
         if self._realtime:
-            with contextlib.suppress(AttributeError, OSError):  # Linux only, and only where it is allowed
-                os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+            raise_priority(PRIORITY)  # a busy computer must not look like a silent gripper
         before = monotonic()
         while not self._end.is_set():
             with self.lock:
@@ -205,7 +202,7 @@ COMMANDS = {
     "block": _Command(
         "block on|off",
         "hold the fingers, so that an activation fails",
-        lambda port, words: setattr(port.gripper, "blocked", words[0] == "on"),
+        lambda port, words: setattr(port.gripper, "blocked", read_switch(words[0])),
     ),
     "power": _Command("power [S|on|off]", "switch its power off for 0.5 s, for S, for good, or on again", _power),
     "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", _end)),

@@ -6,13 +6,12 @@ import argparse
 import contextlib
 import gc
 import ipaddress
-import signal
 import sys
 from collections.abc import Sequence
 
 from hal.errors import HalError
-from hal_emulators.control import CONTROL_PORT, EmulatorControl, serve_prompt
-from hal_emulators.shared_world import enter_world
+from hal_emulators.control import CONTROL_PORT, EmulatorControl, note_signals, serve_prompt
+from hal_emulators.shared_world import enter_world, find_arm
 
 from .controller import Controller
 from .motion import ROBOTS
@@ -62,13 +61,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _serve(options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
+    ends = note_signals()
     controller = Controller(options.robot, options.q, options.payload, options.tcp)
     server = UrServer(options.host, controller, options.seed)
     stack.callback(server.close)
     if options.config is not None:
-        server.world = enter_world(stack, options.config, options.set, "ur", options.host)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: server.stop())
+        arm = find_arm(options.config, options.set, "ur", options.host)
+        server.world = enter_world(stack, options.config, options.set, arm)
     gc.freeze()
     print(
         f"ready: {options.robot} at {options.host}, RTDE {RTDE} ({controller.rate} Hz), dashboard {DASHBOARD}, "
@@ -76,7 +75,7 @@ def _serve(options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
         flush=True,
     )
     serve_prompt(stack.enter_context(EmulatorControl(options.host)).send)
-    server.run()
+    server.run(ends)
 
 
 def _loopback(text: str) -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import random
 import re
 import selectors
@@ -15,19 +14,17 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from hal_emulators.control import CONTROL_PORT
-from hal_emulators.shared_world import ArmInWorld
+from hal_emulators.control import CONTROL_PORT, answer_line, read_switch
+from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .controller import POWER_OFF, RUNNING, Controller
 
 __all__ = ["COMMANDS", "UrServer"]
 
 RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
-_PRIORITY = 40
-"""Of this process among SCHED_FIFO ones; a host has 50."""
 _LONGEST = 1 << 20
 """Most bytes that a client may send without a whole message."""
 _FORMATS = {"VECTOR6D": "6d", "DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q"}
@@ -120,6 +117,8 @@ class _Client:
 class UrServer:
     """The controller's ports on one address.
 
+    The control port is one of them: a ``CommandPort``'s threads would change the controller within a cycle.
+
     Args:
         host: Address to listen on.
         controller: The controller.
@@ -140,7 +139,7 @@ class UrServer:
         self._late: deque[tuple[float, _Client, bytes]] = deque()
         self._lose = self._delay = 0.0
         self._silent_until = self._cut_until = 0.0
-        self._running, self._cycle = True, 0
+        self._cycle = self._lost = 0
         self._listeners: list[socket.socket] = []
         self._control = self._listen(CONTROL_PORT)
         self._listen_all()
@@ -154,12 +153,11 @@ class UrServer:
     def _listen_all(self) -> None:
         self._listeners = [self._listen(port) for port in (RTDE, DASHBOARD, *SCRIPTS)]
 
-    def run(self) -> None:
-        """Serve until :meth:`stop` is called."""
-        with contextlib.suppress(AttributeError, OSError):  # Linux only, and only where it is allowed
-            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+    def run(self, ends: Sequence[object]) -> None:
+        """Serve until something is in ``ends``."""
+        raise_priority(PRIORITY)
         due = time.monotonic()
-        while self._running:
+        while not ends:
             due += self.controller.dt
             self._serve(max(0.0, due - time.monotonic()))
             if time.monotonic() - due > 0.1:  # a computer that slept: time is not made up for
@@ -168,10 +166,6 @@ class UrServer:
             if self.world is not None:
                 self.world.exchange(self.controller.dt, self.controller.motion.q)
             self._publish()
-
-    def stop(self) -> None:
-        """End :meth:`run`; may be called by a signal's handler."""
-        self._running = False
 
     def close(self) -> None:
         """Close all sockets."""
@@ -237,13 +231,10 @@ class UrServer:
 
     def _answer(self, client: _Client, line: str) -> None:
         if client.port == DASHBOARD:
-            self._send(client, self.controller.answer_dashboard(line.lower()).encode() + b"\n")
-            return
-        try:
-            answer = {"ok": True, **self.execute(line.split())}
-        except (ValueError, IndexError) as error:
-            answer = {"ok": False, "error": str(error) or "help lists the commands"}
-        self._send(client, json.dumps(answer).encode() + b"\n")
+            answer = self.controller.answer_dashboard(line.lower())
+        else:
+            answer = json.dumps(answer_line(self.execute, line))
+        self._send(client, answer.encode() + b"\n")
 
     def _take_script(self, client: _Client) -> None:
         """Run a script once its last line has come."""
@@ -311,6 +302,7 @@ class UrServer:
             if not client.started or client.output is None or self._cycle % client.every:
                 continue
             if self._lose and self._random.random() < self._lose:
+                self._lost += 1
                 continue
             state = state or self.controller.read_state()
             data = b"\1" + client.output.pack(state)
@@ -322,9 +314,9 @@ class UrServer:
 
     # Faults.
 
-    def execute(self, words: list[str]) -> dict[str, Any]:
-        """Execute a command of :data:`COMMANDS`. Raises ValueError and IndexError for a wrong one."""
-        name, *values = words
+    def execute(self, line: str) -> dict[str, Any]:
+        """Execute a command of :data:`COMMANDS`. Raises ValueError for a wrong one."""
+        name, *values = line.split() or [""]
         if name not in COMMANDS:
             raise ValueError(f"there is no command {name!r}; help lists them")
         if name == "help":
@@ -334,14 +326,14 @@ class UrServer:
         controller = self.controller
         act: dict[str, Callable[[], object]] = {
             "protective": lambda: controller.stop_protective("C153: requested here"),
-            "estop": lambda: controller.stop_emergency(_switch(values[0])),
-            "safeguard": lambda: controller.set_safeguard(_switch(values[0])),
-            "power": lambda: controller.set_power(RUNNING if _switch(values[0]) else POWER_OFF),
-            "remote": lambda: controller.set_remote(_switch(values[0])),
+            "estop": lambda: controller.stop_emergency(read_switch(values[0])),
+            "safeguard": lambda: controller.set_safeguard(read_switch(values[0])),
+            "power": lambda: controller.set_power(RUNNING if read_switch(values[0]) else POWER_OFF),
+            "remote": lambda: controller.set_remote(read_switch(values[0])),
             "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
             "jog": lambda: controller.jog(int(_number(values[0], 0, 5)), _number(values[1], -3.0, 3.0)),
             "push": lambda: setattr(controller, "force", [*(_number(x, -1e3, 1e3) for x in values[:3]), 0.0, 0.0, 0.0]),
-            "pause": lambda: controller.pause(_switch(values[0])),
+            "pause": lambda: controller.pause(read_switch(values[0])),
             "program": lambda: (
                 controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant")
             ),
@@ -351,7 +343,10 @@ class UrServer:
             "cut": lambda: self._cut(_number(values[0], 0.0, 1e9)),
             "refresh": self._refresh,
         }
-        act[name]()
+        try:
+            act[name]()
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"{error}; usage: {name} {COMMANDS[name][0]}".rstrip()) from None
         return {}
 
     def _cut(self, seconds: float) -> None:
@@ -380,6 +375,7 @@ class UrServer:
             "payload": controller.payload,
             "tcp": controller.tcp,
             "events": controller.events,
+            "lost": self._lost,
             "now": controller.now,
         }
 
@@ -394,9 +390,3 @@ def _number(word: str, least: float, most: float) -> float:
     if not least <= value <= most:
         raise ValueError(f"must be {least:g} to {most:g}, not {word}")
     return value
-
-
-def _switch(word: str) -> bool:
-    if word not in ("on", "off"):
-        raise ValueError(f"takes on or off, not {word!r}")
-    return word == "on"
