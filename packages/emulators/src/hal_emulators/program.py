@@ -4,6 +4,7 @@ hal emulate --config franka_emulator
 hal emulate franka --robot fr3
 hal emulate ur --robot ur5e
 hal emulate can --config yam_emulator
+hal emulate feetech --config so101
 hal emulate robotiq --config franka_robotiq
 """
 
@@ -20,6 +21,7 @@ DEVICES = {
     "can": "every arm on a CAN bus of a rig",
     "franka": "a Franka arm and its hand",
     "ur": "a UR arm",
+    "feetech": "every arm with Feetech servos of a rig",
     "robotiq": "every Robotiq gripper of a rig",
 }
 
