@@ -4,7 +4,7 @@
   its goal, and only then switches its torque on.
 * The motors hold their last goal for ever, with the torque limit of the model: ``halt`` and ``close`` send nothing.
 * The motors' position control has no integrator, so a joint would sag by its load over its stiffness. Goals lead by
-  what the model's weight makes of it; this is faded in after the torque is on.
+  what the model's weight makes of it; this fades in once the torque is on, before the first set-point.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _ENGAGE = 0.8
 """Time in which all motors must be on, s."""
 _PAUSE = 0.1
 """Time without a call of ``engage`` after which it begins anew, s."""
-_FADE = 1.0
-"""Time in which the lead of the goals grows, s."""
+_FADE = 0.3
+"""Time after the torque is on in which the lead of the goals grows, s."""
 _LEAD = 0.1
 """Greatest lead of a goal, rad."""
 _FOLLOWING, _LAG, _FOLLOWING_PATIENCE = 0.2, 0.15, 0.1
@@ -69,13 +69,14 @@ class FeetechArm(RobotDriver):
         """Fault that ended an engagement; kept until recover()."""
         self._t_states, self._t_engaging, self._t_last_try, self._t_on = -inf, -inf, -inf, -inf
         """When the states were asked for, engaging began and went on, and the torque was switched on, s."""
-        self._prepared: list[int] = []
-        """Goals that the motors were given before their torque is switched on."""
+        self._goals: list[int] = []
+        self._first: list[int] = []
+        """Goals that the motors have while they are engaged, and those before their torque is switched on."""
         self._sent: deque[tuple[list[int], Setpoint]] = deque(maxlen=_SENT)
         self._lead = [0.0] * len(self.spec.joints)
         """Present lead of the goals, rad."""
         self._held: list[bool] = []
-        """Which joints were held already when they were engaged: their goals lead at once."""
+        """Which joints were held already before they were engaged: their goals lead already."""
 
     def open(self) -> None:
         """Connect, and check the motors (:meth:`Chain.open`). Nothing moves, and nothing is written."""
@@ -139,7 +140,6 @@ class FeetechArm(RobotDriver):
 
     def _disengage(self) -> None:
         self.engaged, self._t_last_try = False, -inf
-        self._prepared = []
         self._following.forget()
 
     def _stay(self, states: Sequence[MotorState]) -> None:
@@ -153,6 +153,7 @@ class FeetechArm(RobotDriver):
         return [min(max(round(x), c.range_min), c.range_max) for x, c in zip(counts, stored, strict=True)]
 
     def write(self, setpoint: Setpoint) -> bool:
+        self.chain.check()
         if not self.engaged:
             return False
         self._lead = self._find_lead(setpoint.q)
@@ -167,10 +168,9 @@ class FeetechArm(RobotDriver):
 
     def _find_lead(self, q: Sequence[float]) -> list[float]:
         """Return by how much the goals lead, rad: weight over stiffness."""
-        share = min(1.0, max(0.0, (self._now - self._t_on) / _FADE))
         return [
-            (1.0 if held else share) * min(max(float(tau) / (STIFFNESS * max(1, r.gain)), -_LEAD), _LEAD)
-            for tau, r, held in zip(self._dynamics.gravity(q), self.chain.registers, self._held, strict=True)
+            min(max(float(tau) / (STIFFNESS * max(1, registers.gain)), -_LEAD), _LEAD)
+            for tau, registers in zip(self._dynamics.gravity(q), self.chain.registers, strict=True)
         ]
 
     def halt(self) -> None:
@@ -185,23 +185,24 @@ class FeetechArm(RobotDriver):
             RobotFault: A motor reports an error, is too far outside of its range, or does not switch on.
             ConnectionLost: A motor does not answer.
         """
-        if self.engaged:
-            return
         self.chain.check()
         states = self._states
+        if self.engaged or not states:
+            return
         fault = self._fault or self.chain.fault(states) or self.find_outside()
         if fault is not None:
             raise self._refusal(Fault(fault.code, fault.cause, f"{fault.remedy}; then robot.recover()"))
         if self._now - self._t_last_try > _PAUSE:  # a new attempt
-            self._t_engaging, self._prepared = self._now, []
+            self._t_engaging, self._t_on, self._goals = self._now, inf, []
         self._t_last_try = self._now
-        if [state.goal for state in states] != self._prepared:
+        if self._t_on == inf and [state.goal for state in states] != self._goals:
             self._prepare(states)
-        elif all(state.on for state in states):
-            self.engaged, self._t_on = True, self._now
-            return
-        else:
+        elif not all(state.on for state in states):
             self.chain.switch_on()
+        else:
+            self._t_on = min(self._t_on, self._now)
+            self.engaged = self._fade_in(min(1.0, (self._now - self._t_on) / _FADE))
+            return
         if self._now - self._t_engaging > _ENGAGE:
             off = [label for label, state in zip(self.chain.labels.values(), states, strict=True) if not state.on]
             cause = f"{', '.join(off) or 'a motor'} does not switch on"
@@ -217,9 +218,16 @@ class FeetechArm(RobotDriver):
             for r, torque in zip(self.chain.registers, torques, strict=True)
         ]
         self.chain.prepare(goals, limits)
-        self._prepared, self._t_on = goals, inf
+        self._goals, self._first, self._t_on = goals, goals, inf
         self._sent.clear()
         self._lead = self._find_lead(self._angles([state.position for state in states]))
+
+    def _fade_in(self, share: float) -> bool:
+        """Let this share of the lead act on the joints that were not held before; return whether that is all of it."""
+        leads = [0.0 if held else share * lead / COUNT for held, lead in zip(self._held, self._lead, strict=True)]
+        self._goals = self._clip([goal + lead for goal, lead in zip(self._first, leads, strict=True)])
+        self.chain.write_goals(self._goals)
+        return share >= 1.0
 
     def find_outside(self) -> Fault | None:
         """Return a fault that names the joints so far outside of their ranges that a motor would pull them in."""

@@ -25,7 +25,7 @@ ALL = 0xFE
 BAUD = 1_000_000
 BAUDS = (500_000, 115_200, 57_600, 38_400)
 """Other rates that a motor may be set to, as far as the kernel has them."""
-_ANSWER, _OPENING = 0.006, 0.02
+_ANSWER, _OPENING = 0.007, 0.02
 """Longest time to wait for answers in a cycle of 100 Hz, and while a device is opened, s."""
 STATE, STATE_SIZE = 40, 31
 """First register of a motor's state, and the number of bytes that are read from there."""

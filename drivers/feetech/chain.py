@@ -279,7 +279,7 @@ class Chain:
         return None
 
     def clear(self, wait: Callable[[], Sequence[MotorState]]) -> None:
-        """End overloads by switching on again what is on, and check that nothing else is wrong.
+        """End overloads by writing the torque of their motors again, on or off, and check that nothing else is wrong.
 
         Args:
             wait: Returns the states one cycle later.
@@ -288,7 +288,7 @@ class Chain:
             RobotFault: An error stays.
         """
         states = wait()
-        hold = {id: b"\x01" for id, state in zip(self.ids, states, strict=True) if state.on and state.error & 0x28}
+        hold = {id: bytes((state.on,)) for id, state in zip(self.ids, states, strict=True) if state.error & 0x28}
         if hold:
             here = {id: state.position for id, state in zip(self.ids, states, strict=True) if id in hold}
             self.write(42, {id: max(0, count).to_bytes(2, "little") for id, count in here.items()})

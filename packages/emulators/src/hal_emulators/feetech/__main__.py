@@ -12,7 +12,7 @@ from hal.errors import HalError
 from hal_emulators.control import CommandPort, add_rig_options, note_signals, serve_prompt
 from hal_emulators.shared_world import enter_world, has_world
 
-from .server import FeetechEmulator, help_text
+from .server import FeetechEmulator, find_arms, help_text
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ends = note_signals()
     try:
         with contextlib.ExitStack() as stack:
-            emulator = FeetechEmulator(options.config, options.set, options.seed, realtime=True)
+            emulator = FeetechEmulator(find_arms(options.config, options.set), options.seed, realtime=True)
             if not options.no_world and has_world(options.config, options.set):
                 for arm in emulator.arms.values():
                     arm.world = enter_world(stack, options.config, options.set, arm.spec)

@@ -22,7 +22,7 @@ __all__ = ["EmulatedArm", "Servo"]
 _STALL = STALL_TORQUES[12.0]
 _SPEED = 4.7
 """Without a load, rad/s: 45 rpm."""
-_MECHANICS = JointMechanics(inertia=0.02, coulomb=0.05, viscous=0.05, torque=_STALL)
+_MECHANICS = JointMechanics(inertia=0.006, coulomb=0.05, viscous=0.05, torque=_STALL)
 """Chosen."""
 _SIZE, _EEPROM = 90, 40
 _OVERLOAD, _OVERLOAD_TIME, _PROTECTED = 0.8, 2.0, 200
@@ -44,7 +44,7 @@ class Servo:
         self.error = 0
         self.voltage, self.temperature = 121, 31
         self.angle, self.speed, self.torque = 0.0, 0.0, 0.0
-        self._overloaded, self._strained = False, 0.0
+        self.overloaded, self._strained = False, 0.0
         for address, value in ((0, 3), (1, 9), (5, id), (8, 1), (13, 70), (14, 140), (15, 40), (18, 12), (21, 32)):
             self.registers[address] = value
         offset = abs(homing) | (0x800 if homing < 0 else 0)
@@ -66,7 +66,7 @@ class Servo:
         self.put(48, self.word(16))
         self.registers[55] = 1
         self._target = self.angle
-        self._overloaded, self._strained = False, 0.0
+        self.overloaded, self._strained = False, 0.0
         self.put(42, round(self.angle))
 
     @property
@@ -74,7 +74,7 @@ class Servo:
         """The bits that it reports."""
         wrong = not self.registers[15] <= self.voltage <= self.registers[14]
         hot = self.temperature > self.registers[13]
-        return self.error | wrong | hot << 2 | self._overloaded << 5
+        return self.error | wrong | hot << 2 | self.overloaded << 5
 
     def read(self, address: int, size: int) -> bytes:
         """Return registers, with the present state."""
@@ -93,7 +93,7 @@ class Servo:
             if k < 56 and (k >= _EEPROM or not self.registers[55]):
                 self.registers[k] = value
         if address <= 40 < address + len(data):
-            self._overloaded, self._strained = False, 0.0
+            self.overloaded, self._strained = False, 0.0
 
     def drive(self, dt: float, off: float) -> Drive:
         """Return what its motor does in a step of ``dt`` s; ``off`` is the joint's angle at the count 0, rad."""
@@ -103,11 +103,11 @@ class Servo:
         goal = min(max(self.word(42), self.word(9)), self.word(11))
         step = self.word(46) * dt or 1e9
         self._target += min(max(goal - self._target, -step), step)
-        limit = min(self.word(48), self.word(16), _PROTECTED if self._overloaded else 1000) / 1000 * _STALL
+        limit = min(self.word(48), self.word(16), _PROTECTED if self.overloaded else 1000) / 1000 * _STALL
         stiffness, damping = STIFFNESS * self.registers[21], _STALL / _SPEED
         torque = stiffness * (self._target - self.angle) * COUNT
         self._strained = self._strained + dt if abs(self.torque) > _OVERLOAD * _STALL else 0.0
-        self._overloaded |= self._strained > _OVERLOAD_TIME
+        self.overloaded |= self._strained > _OVERLOAD_TIME
         if abs(torque) > limit:
             return Drive(kd=damping, tau=limit if torque > 0.0 else -limit)
         return Drive(self._target * COUNT + off, 0.0, stiffness, damping)

@@ -1,6 +1,6 @@
 """The emulator at work: one thread moves the arms of a rig in real time, and answers; commands inject faults.
 
-with FeetechEmulator("so101") as emulator:
+with FeetechEmulator(find_arms("so101")) as emulator:
     emulator.execute("lose next 3 2")         # from any thread
 """
 
@@ -13,20 +13,21 @@ import select
 import signal
 import termios
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any, NamedTuple
 
 from hal.config.loader import load
 from hal.drivers.feetech.bus import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer, encode, split
+from hal.specs import RobotSpec
 from hal_emulators.control import read_switch
 from hal_emulators.shared_world import PRIORITY, raise_priority
 from hal_emulators.terminal import PseudoTerminal
 
 from .arm import EmulatedArm
 
-__all__ = ["FeetechEmulator", "help_text"]
+__all__ = ["FeetechEmulator", "find_arms", "help_text"]
 
 _STEP = 0.002
 """Step of the mechanics, s."""
@@ -124,6 +125,14 @@ class ServoLine:
                 os.write(self.terminal.descriptors[0], due)
 
 
+def find_arms(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
+    """Return the arms of a rig that this emulator can play. Raises ConfigError and ValueError."""
+    found = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver == "feetech"]
+    if not found:
+        raise ValueError("this rig has no arm with Feetech servos that is not simulated")
+    return found
+
+
 class FeetechEmulator:
     """All arms of a rig on servo buses, each on its line.
 
@@ -133,30 +142,20 @@ class FeetechEmulator:
     """
 
     def __init__(
-        self,
-        config: str | Path | Mapping[str, Any],
-        overrides: Sequence[str] = (),
-        seed: int = 0,
-        paced: bool = True,
-        realtime: bool = False,
+        self, arms: Iterable[RobotSpec], seed: int = 0, paced: bool = True, realtime: bool = False
     ) -> None:
-        """Build the arms of a rig that have this driver and are not simulated.
+        """Build the arms.
 
         Args:
-            config: The rig, as for :func:`hal.open`.
-            overrides: Changes of it.
+            arms: Their records; see :func:`find_arms`.
             seed: Of random losses.
             paced: Whether they move in real time; otherwise only by :meth:`advance`.
             realtime: Give the thread the priority of a servo, for a process that does nothing else.
 
         Raises:
-            ConfigError: The rig has problems.
-            ValueError: It has no such arm, or two on one port, which this emulator does not play.
+            ValueError: Two are on one port, which this emulator does not play, or a port is not an emulator's.
         """
-        found = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots]
-        self.arms = {spec.name: EmulatedArm(spec) for spec in found if spec.driver == "feetech"}
-        if not self.arms:
-            raise ValueError("this rig has no arm with Feetech servos that is not simulated")
+        self.arms = {spec.name: EmulatedArm(spec) for spec in arms}
         if len({arm.port for arm in self.arms.values()}) < len(self.arms):
             raise ValueError("two emulated arms need two ports")
         self.lines = {name: ServoLine(arm, seed) for name, arm in self.arms.items()}
