@@ -48,8 +48,8 @@ def so101_gripper() -> Iterator[GripperBench]:
         with closing(FeetechGripper(far.spec.gripper)) as driver:
             yield GripperBench(
                 driver=driver,
-                dt=0.01,
-                advance=lambda: far.advance(0.01),
+                dt=0.02,  # so long that the steps of a count, 0.1 mm, matter little for a speed
+                advance=lambda: far.advance(0.02),
                 patience=0.7,
                 lose=lambda: far.execute("unplug on") and None,
                 restore=lambda: far.execute("unplug off") and None,

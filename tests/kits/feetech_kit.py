@@ -66,10 +66,12 @@ class FeetechProcess:
 
     Attributes:
         overrides: For :func:`hal.open` of ``so101``.
+        port: Where it is.
     """
 
     def __init__(self) -> None:
         self.overrides = feetech_overrides()
+        self.port = self.overrides[-1].partition("=")[2]
         options = [word for value in self.overrides for word in ("--set", value)]
         command = [sys.executable, "-m", "hal_emulators.feetech", "--config", "so101", *options]
         self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)

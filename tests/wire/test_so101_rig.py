@@ -86,7 +86,7 @@ def test_a_fault_of_bus_or_motor_stops_the_program_and_the_arm_moves_again_after
             wait_until(lambda: not answers(arm), "lost")
         emulator.execute("reset")
         wait_until(lambda: answers(arm), "answers again")
-        emulator.execute("place")  # someone holds it
+        emulator.execute("place 0 -0.6 0.87 1.3 -1.524")  # someone lifts and holds it
         wait_until(lambda: answers(arm), "answers")
         arm.recover()
         peak: Any = emulator.execute("reset") or emulator.execute("state")["peak_speed"]
@@ -113,3 +113,33 @@ def test_an_arm_whose_program_is_killed_holds() -> None:
         last = emulator.execute("state")
         assert all(last["on"][:5])
         assert last["q"] == pytest.approx(first["q"], abs=1e-3)
+
+
+def test_feetechs_own_library_drives_the_motors() -> None:
+    scs = pytest.importorskip("scservo_sdk", reason="needs feetech-servo-sdk: pip install 'robot-hal[test]'")
+    with FeetechProcess() as emulator:
+        port, packets = scs.PortHandler(emulator.port), scs.PacketHandler(0)
+        try:
+            assert port.openPort()
+            assert port.setBaudRate(1_000_000)
+            assert packets.ping(port, 1) == (777, scs.COMM_SUCCESS, 0)
+            reader = scs.GroupSyncRead(port, packets, 56, 2)
+            writer = scs.GroupSyncWrite(port, packets, 42, 2)
+            for id in range(1, 7):
+                assert reader.addParam(id)
+            assert reader.txRxPacket() == scs.COMM_SUCCESS
+            first = [reader.getData(id, 56, 2) for id in range(1, 7)]
+            goals = [count + 50 for count in first]
+            for id, goal in enumerate(goals, 1):
+                assert writer.addParam(id, [goal & 255, goal >> 8])
+            assert writer.txPacket() == scs.COMM_SUCCESS
+            for id in range(1, 7):
+                assert packets.write1ByteTxRx(port, id, 40, 1) == (scs.COMM_SUCCESS, 0)
+            time.sleep(1.0)
+            bad = sum(reader.txRxPacket() != scs.COMM_SUCCESS for _ in range(300))
+            last = [reader.getData(id, 56, 2) for id in range(1, 7)]
+        finally:
+            port.closePort()
+    assert bad <= 3  # a busy computer
+    assert last == pytest.approx(goals, abs=12), "the weight pulls them off their goals"
+    assert all(b - a > 30 for a, b in zip(first, last, strict=True))

@@ -91,7 +91,7 @@ def test_goals_are_the_present_positions_before_the_torque_is_on_and_nothing_lea
     arm.run(0.5)
     assert reading.q_commanded == pytest.approx(before, abs=2e-3)
     assert arm.run().q == pytest.approx(before, abs=2e-3), "its weight is carried"
-    assert max(arm.far.arm.peak) < 0.2  # rad/s
+    assert max(arm.far.arm.peak) < 0.3, "rad/s: its load bends the motors' springs, until the goals lead"
 
 
 def test_a_load_does_not_pull_it_off_its_set_point(arm: Arm) -> None:

@@ -165,8 +165,11 @@ class FeetechEmulator:
         self._thread = threading.Thread(target=self._serve, name="feetech-emulator", daemon=True)
 
     def advance(self, seconds: float) -> None:
-        """Move the arms by ``seconds`` at once."""
+        """Take what has come, and move the arms by ``seconds`` at once."""
         with self.lock:
+            for line in self.lines.values():
+                if line.terminal.descriptors and select.select(line.terminal.descriptors, [], [], 0.0)[0]:
+                    line.serve()
             self._advance(seconds)
 
     def _advance(self, seconds: float) -> None:
