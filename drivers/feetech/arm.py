@@ -107,8 +107,10 @@ class FeetechArm(RobotDriver):
         dq = tuple(COUNT * state.velocity for state in states)
         commanded = self._find_commanded(states) if self.engaged else None
         fault = self._judge(states, q, commanded)
-        target = (commanded.q, commanded.dq) if commanded is not None and self.engaged else (None, None)
-        return Reading(t, t, self._seq, q, dq, None, *target, fault=fault)
+        reading = Reading(t, t, self._seq, q, dq, fault=fault)
+        if commanded is None or not self.engaged:
+            return reading
+        return reading._replace(q_commanded=commanded.q, dq_commanded=commanded.dq)
 
     def _angles(self, counts: Sequence[int]) -> tuple[float, ...]:
         return tuple(COUNT * (count - middle) for count, middle in zip(counts, self._middle, strict=True))
@@ -158,8 +160,7 @@ class FeetechArm(RobotDriver):
             return False
         self._lead = self._find_lead(setpoint.q)
         counts = [
-            (q + lead) / COUNT + middle
-            for q, lead, middle in zip(setpoint.q, self._lead, self._middle, strict=True)
+            (q + lead) / COUNT + middle for q, lead, middle in zip(setpoint.q, self._lead, self._middle, strict=True)
         ]
         goals = self._clip(counts)
         self.chain.write_goals(goals)
@@ -195,9 +196,10 @@ class FeetechArm(RobotDriver):
         if self._now - self._t_last_try > _PAUSE:  # a new attempt
             self._t_engaging, self._t_on, self._goals = self._now, inf, []
         self._t_last_try = self._now
-        if self._t_on == inf and [state.goal for state in states] != self._goals:
-            self._prepare(states)
-        elif not all(state.on for state in states):
+        on = all(state.on for state in states)
+        if not on and self._t_on < inf or self._t_on == inf and [state.goal for state in states] != self._goals:
+            self._prepare(states)  # also motors that went off meanwhile: their goals may be any
+        elif not on:
             self.chain.switch_on()
         else:
             self._t_on = min(self._t_on, self._now)

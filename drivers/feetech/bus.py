@@ -81,7 +81,8 @@ def encode(id: int, instruction: int, data: bytes = b"") -> bytes:
 
 def split(came: bytes) -> tuple[list[Answer], bytes, int]:
     """Return the whole frames in what has come, the rest, and the number of frames with a wrong checksum."""
-    found, spoilt = [], 0
+    found: list[Answer] = []
+    spoilt = 0
     while (start := came.find(b"\xff\xff")) >= 0:
         came = came[start:]
         if len(came) < 4 or (came[2] < ALL + 1 and came[3] >= 2 and len(came) < came[3] + 4):

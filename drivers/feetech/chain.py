@@ -35,8 +35,16 @@ _IDENTIFY_PERIOD = 0.5
 _SPANS = 0.6, 1.3
 """Calibrated range of a joint as a share of the model's: outside of it the motor is not calibrated, or another one."""
 ERRORS = {
-    1: ("voltage", "has a supply of {0.voltage:.1f} V", "check the supply: 12 V for a 12 V motor, 5 to 7.4 V for others"),
-    2: ("sensor", "has a faulty angle sensor", "switch the power off and on, with the arm supported; replace the motor"),
+    1: (
+        "voltage",
+        "has a supply of {0.voltage:.1f} V",
+        "check the supply: 12 V for a 12 V motor, 5 to 7.4 V for others",
+    ),
+    2: (
+        "sensor",
+        "has a faulty angle sensor",
+        "switch the power off and on, with the arm supported; replace the motor",
+    ),
     4: ("too_hot", "has {0.temperature} deg C", "let it cool down; lower its load or its speed"),
     8: ("overcurrent", "draws too much current", "check what the arm touches, and its load"),
     32: ("overload", "is overloaded, and has reduced its torque", "check what the arm touches, and its load"),
@@ -173,8 +181,8 @@ class Chain:
         if baud is not None:
             return f" at 1000000 bit/s, but at {baud}; set it with lerobot-setup-motors"
         if bus.port.endswith(".emulated"):
-            return f"; start the emulator in another terminal: hal emulate feetech --config RIG"
-        return f"; switch on the motors' power supply, and check the cable between board and arm"
+            return "; start the emulator in another terminal: hal emulate feetech --config RIG"
+        return "; switch on the motors' power supply, and check the cable between board and arm"
 
     def _check_registers(self, id: int, found: Registers) -> Iterator[tuple[str, str]]:
         """Yield what is wrong with a motor: message and code."""
@@ -187,7 +195,9 @@ class Chain:
         span = (stored.range_max - stored.range_min) * COUNT
         least, most = (share * self._spans[id] for share in _SPANS)
         if not least <= span <= most:
-            message = f"its range is {span:.2f} rad, {self._spans[id]:.2f} in the model; calibrate it: lerobot-calibrate"
+            message = (
+                f"its range is {span:.2f} rad, {self._spans[id]:.2f} in the model; calibrate it: lerobot-calibrate"
+            )
             yield message, "not_calibrated"
         wanted = self.settings.read_calibration().get(id, stored)
         for name, ours, theirs in zip(Calibration._fields, wanted, stored, strict=True):
@@ -205,7 +215,10 @@ class Chain:
         if bus is None:
             raise ConnectionLost(f"{self.name} is not open", code="not_open")
         try:
-            bus.exchange(self, now)
+            for _ in range(4):  # of motors that are new, also where an answer is lost
+                bus.exchange(self, now)
+                if all(id in bus.states for id in self.ids):
+                    break
             if self._opened != bus.opened:
                 self._identify_again(bus, now)
         except ConnectionLost as error:
@@ -297,5 +310,3 @@ class Chain:
         fault = self.fault(states)
         if fault is not None:
             raise RobotFault(f"{self.name}: {fault.cause}", fault.remedy, code=fault.code)
-
-

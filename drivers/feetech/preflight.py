@@ -39,9 +39,11 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
     """
     arm = FeetechArm(spec)
     shared = spec.gripper is not None and spec.gripper.driver == spec.driver
-    gripper = FeetechGripper(spec.gripper) if shared and spec.gripper is not None else None
+    devices: list[FeetechArm | FeetechGripper] = [arm]
+    if shared and spec.gripper is not None:
+        devices.append(FeetechGripper(spec.gripper))
     try:
-        for device in (arm, *([gripper] if gripper is not None else [])):
+        for device in devices:
             device.open()
             states = device.chain.read(monotonic())
             yield from _check_motors(device.chain, states)
@@ -57,9 +59,8 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         found, _, remedy = str(error).partition("; ")
         yield CheckResult("motors", "fail", found, remedy)
     finally:
-        arm.close()
-        if gripper is not None:
-            gripper.close()
+        for device in devices:
+            device.close()
 
 
 def _check_motors(chain: Chain, states: Sequence[MotorState]) -> Iterator[CheckResult]:

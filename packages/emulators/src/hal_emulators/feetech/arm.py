@@ -130,9 +130,7 @@ class EmulatedArm:
         self.spec = spec
         settings = FeetechArmSettings.of(spec)
         self.port = settings.port
-        self.plant = ArmPlant(
-            spec.kinematics, [_MECHANICS] * len(settings.ids), spec.initial, spec.base_orientation
-        )
+        self.plant = ArmPlant(spec.kinematics, [_MECHANICS] * len(settings.ids), spec.initial, spec.base_orientation)
         if spec.payload is not None:
             self.plant.load(payload=(spec.payload.mass, spec.payload.position))
         self.servos: dict[int, Servo] = {}

@@ -141,9 +141,7 @@ class FeetechEmulator:
         lines: Their lines.
     """
 
-    def __init__(
-        self, arms: Iterable[RobotSpec], seed: int = 0, paced: bool = True, realtime: bool = False
-    ) -> None:
+    def __init__(self, arms: Iterable[RobotSpec], seed: int = 0, paced: bool = True, realtime: bool = False) -> None:
         """Build the arms.
 
         Args:
