@@ -197,7 +197,7 @@ class FeetechArm(RobotDriver):
             self._t_engaging, self._t_on, self._goals = self._now, inf, []
         self._t_last_try = self._now
         on = all(state.on for state in states)
-        if not on and self._t_on < inf or self._t_on == inf and [state.goal for state in states] != self._goals:
+        if (not on and self._t_on < inf) or (self._t_on == inf and [state.goal for state in states] != self._goals):
             self._prepare(states)  # also motors that went off meanwhile: their goals may be any
         elif not on:
             self.chain.switch_on()
