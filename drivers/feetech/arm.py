@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from math import inf
+from pathlib import Path
 from time import sleep
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from hal.driver import Reading, RobotDriver, Setpoint
 from hal.dynamics import Dynamics
 from hal.errors import Fault, RobotFault
 from hal.following import Following
+from hal.kinematics.urdf import read_urdf
 from hal.specs import RobotSpec
 
 from .bus import MotorState
@@ -51,8 +53,9 @@ class FeetechArm(RobotDriver):
         super().__init__(spec, world)
         self.settings = FeetechArmSettings.of(spec)
         self.engaged = False
-        limits = spec.limits
-        spans = [high - low for low, high in zip(limits.lower, limits.upper, strict=True)]
+        urdf = read_urdf(Path(spec.urdf), meshes=False).joints
+        ends = [(urdf[name].lower or 0.0, urdf[name].upper or 0.0) for name in spec.joints]
+        spans = [high - low for low, high in ends]  # not of the limits, which a rig may tighten
         self.chain = Chain(spec.name, self.settings, self.settings.ids, spec.joints, spans)
         self._dynamics = Dynamics.of(spec)
         labels = list(self.chain.labels.values())

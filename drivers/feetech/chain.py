@@ -167,8 +167,6 @@ class Chain:
                     "lerobot-setup-motors",
                     code="id_twice",
                 )
-            if bus.surplus + bus.spoilt > surplus + spoilt:
-                continue
         return bool(bus.ask(id, PING, b"", (id,)))
 
     def _explain_missing(self, bus: ServoBus, missing: Sequence[int]) -> str:
@@ -243,7 +241,11 @@ class Chain:
         if self.lost is not None and now - self._t_identified < _IDENTIFY_PERIOD:
             raise self.lost
         self._t_identified = now
+        before = self.registers
         self._identify(bus)
+        if self.registers != before:
+            self.registers, self._opened = before, 0
+            raise DeviceNotFound(f"{self.name}: other motors, or calibrated otherwise than before", code="other_motors")
         self._t_heard.clear()
 
     def _silence(self, bus: ServoBus, silent: Sequence[str]) -> ConnectionLost:

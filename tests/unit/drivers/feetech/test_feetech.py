@@ -8,6 +8,7 @@ from contextlib import closing, suppress
 from dataclasses import replace
 from math import pi
 from pathlib import Path
+from time import monotonic, sleep
 
 import pytest
 from feetech_kit import SteppedFeetech
@@ -192,6 +193,34 @@ def test_a_silent_motor_is_lost_after_a_tenth_of_a_second_and_comes_back(
         arm.driver.engage()
         arm.run()
     assert arm.driver.engaged
+
+
+def test_an_arm_that_was_plugged_in_instead_is_not_driven(arm: Arm) -> None:
+    arm.engage()
+    arm.far.execute("unplug on")
+    with pytest.raises(ConnectionLost, match="cable|plug in"):
+        arm.run()
+    arm.far.execute("register 2 9 950")
+    arm.far.execute("unplug off")
+    deadline = monotonic() + 5.0
+    while "other motors" not in (text := lose(arm)):
+        assert monotonic() < deadline, text
+        sleep(0.02)
+    with pytest.raises(ConnectionLost):
+        arm.driver.engage()
+
+
+def lose(arm: Arm) -> str:
+    """Return why the arm counts as lost."""
+    with pytest.raises(ConnectionLost) as caught:
+        arm.run()
+    return str(caught.value)
+
+
+def test_tighter_limits_of_a_rig_are_no_wrong_calibration(arm: Arm) -> None:
+    limits = replace(arm.far.spec.limits, lower=(-0.3,) * 5, upper=(0.9,) * 5)
+    with closing(FeetechArm(replace(arm.far.spec, limits=limits))) as driver:
+        driver.open()
 
 
 def test_lerobots_calibration_file_must_be_what_the_motors_hold(arm: Arm, tmp_path: Path) -> None:
