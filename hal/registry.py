@@ -35,6 +35,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
         "damiao": "hal.drivers.can:DAMIAO",
         "evdev": "hal.drivers.evdev:DRIVER",
+        "feetech": "hal.drivers.feetech:DRIVER",
         "franka": "hal.drivers.franka:DRIVER",
         "mock": "hal.drivers.mock:DRIVER",
         "mujoco": "hal.drivers.mujoco:DRIVER",

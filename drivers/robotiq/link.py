@@ -6,20 +6,17 @@ Registers: instruction manual "2F-85 & 2F-140" (2019-02-06), chapters 4.3 to 4.7
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import select
 import socket
 import struct
-import termios
-import tty
 from collections.abc import Callable, Generator
-from pathlib import Path
 from time import monotonic, sleep
 from typing import NamedTuple
 
 from hal.errors import ConnectionLost
+from hal.serial_line import explain, open_line, read_line
 
 from .settings import RobotiqSettings
 
@@ -32,12 +29,7 @@ _RETRY = 0.25
 """Time between two tries to connect, s."""
 _PATIENCE = 0.005
 """Longest wait for answers in one call, s."""
-_ADVICE = {
-    errno.ENOENT: "plug in its adapter; serial devices here: ",
-    errno.EACCES: "sudo usermod -aG dialout $USER, then log out and in",
-    errno.EBUSY: "end the other program that uses it",
-    errno.ECONNREFUSED: "install Robotiq's URCap on the controller, and switch it on",
-}
+_ADVICE = {errno.ECONNREFUSED: "install Robotiq's URCap on the controller, and switch it on"}
 _READ, _WRITE = 3, 16
 _OUTPUT, _INPUT = 0x03E8, 0x07D0
 _TEXT = re.compile(rb"\s*(ack|([A-Z]{3}) +(\d+|\?))\s*$")
@@ -89,18 +81,7 @@ class _Modbus:
         self.path = str(settings.port)
 
     def connect(self) -> int:
-        line = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        try:
-            fcntl.ioctl(line, termios.TIOCEXCL)  # a second program would take half of the answers
-            tty.setraw(line, termios.TCSANOW)
-            mode = termios.tcgetattr(line)
-            mode[2] = termios.CS8 | termios.CREAD | termios.CLOCAL
-            mode[4] = mode[5] = termios.B115200
-            termios.tcsetattr(line, termios.TCSANOW, mode)
-        except (OSError, termios.error) as error:
-            os.close(line)
-            raise OSError(errno.ENOTTY, f"is no serial line ({error})") from None
-        return line
+        return open_line(self.path, 115_200)
 
     def _ask(self, function: int, data: bytes, size: int) -> Question:
         head = bytes((self.slave, function))
@@ -213,9 +194,7 @@ class Link:
 
     def _lose(self, why: OSError | str) -> None:
         if isinstance(why, OSError):
-            there = ", ".join(map(str, Path("/dev/serial/by-id").glob("*"))) or "none"
-            advice = _ADVICE.get(why.errno or 0, "check its cable and its power")
-            why = f"{why.strerror}; {advice}{there if why.errno == errno.ENOENT else ''}"
+            why = explain(why, _ADVICE)
         self.close()
         self.status, self._why = None, why
 
@@ -238,7 +217,7 @@ class Link:
 
     def _advance(self, line: int, now: float) -> bool:
         """Take what has come, and send what is due; return whether an answer is awaited."""
-        came = _receive(line)
+        came = read_line(line)
         if self._exchange is None:
             if now < self._t_quiet:
                 return False  # late answers to a repeated question are dropped
@@ -278,14 +257,3 @@ class Link:
             os.write(line, self._question[0])
         except BlockingIOError:
             self._t_sent = 0.0  # still connecting: again in the next turn
-
-
-def _receive(line: int) -> bytes:
-    """Return what has come. Raises OSError if the line is gone."""
-    try:
-        came = os.read(line, 4096)
-    except BlockingIOError:
-        return b""
-    if not came:
-        raise OSError(errno.EIO, "it was disconnected")
-    return came

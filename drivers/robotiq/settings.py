@@ -7,12 +7,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field
 
+from hal import serial_line
 from hal.config.files import DeviceSettings
 from hal.config.schema import Host, ValueProblem, is_own_host
 from hal.specs import GripperSpec
-
-EMULATED = ".emulated"
-"""End of the name of an emulator's port: a pseudo terminal alone may also lead to a gripper, over a network."""
 
 
 class Figures(NamedTuple):
@@ -71,5 +69,4 @@ def check_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
 
 def is_emulated(options: Mapping[str, Any]) -> bool:
     """Return whether these options are those of an emulator."""
-    port = options.get("port")
-    return is_own_host(options) if port is None else str(port).endswith(EMULATED)
+    return is_own_host(options) if options.get("port") is None else serial_line.is_emulated(options)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,7 @@ def _bounds(shape: ElementTree.Element | None, folder: Path) -> Any:
     return -half, half
 
 
+@lru_cache(maxsize=256)
 def _mesh_bounds(file: Path, scale: str) -> Any:
     import trimesh  # 0.3 s
 

@@ -43,6 +43,7 @@ from .benches import (
 from .can_arms import piper_arm, piper_gripper
 from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
+from .feetechs import so101_arm, so101_gripper
 from .frankas import FR3, franka_hand
 from .pads import mock_pad, playback_pad, terminal_steps, web_pad
 from .robotiqs import robotiq_gripper
@@ -93,6 +94,15 @@ class TestEmulatedDamiaoArm(
     """A YAM, in memory, and in step with the bench's clock."""
 
     bench = bench_of(damiao_arm)
+
+
+ASKED = {"freeze": "a motor answers each question: one that does not for 0.1 s is lost"}
+
+
+class TestEmulatedSo101(RobotContract, left_out=ASKED | {"torque": "its motors take positions"}):
+    """On a pseudo terminal, and in step with the bench's clock."""
+
+    bench = bench_of(so101_arm)
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +231,10 @@ class TestEmulatedPiperGripper(GripperContract, left_out=PIPER_REPORTS):
 
 class TestEmulatedDamiaoGripper(GripperContract, left_out={"freeze": "a silent motor is lost"}):
     bench = bench_of(damiao_gripper)
+
+
+class TestEmulatedSo101Gripper(GripperContract, left_out=ASKED):
+    bench = bench_of(so101_gripper)
 
 
 @pytest.mark.slow

@@ -39,6 +39,13 @@ ELSEWHERE = {
         f"{WIRE}ur_rig.py::test_the_controller_stops_its_program_when_the_host_is_killed",
         f"{WIRE}ur_rig.py::test_the_arm_stands_150_ms_after_the_last_message",
     ),
+    "a UFACTORY arm stops": (
+        f"{WIRE}xarm_faults.py::test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover",
+    ),
+    "the host of a UFACTORY arm dies": (
+        f"{WIRE}xarm_rig.py::test_the_arm_stands_at_its_last_set_point_when_the_host_is_killed",
+        f"{WIRE}xarm_rig.py::test_the_arm_stands_while_the_host_is_frozen_and_continues_without_a_jump",
+    ),
     "the host of an arm with Damiao": (f"{WIRE}can_gravity.py::test_an_arm_without_its_program_sinks_slowly",),
     "an arm with Damiao motors is closed": (
         f"{CAN}close_lowers_a_raised_arm_slowly_and_never_drops_it",
@@ -48,6 +55,8 @@ ELSEWHERE = {
         f"{WIRE}piper_rig.py::test_an_arm_whose_program_ends_holds",
         f"{WIRE}piper_rig.py::test_a_bus_that_is_cut_stops_the_program_and_comes_back",
     ),
+    "the host of an SO-101 dies": (f"{WIRE}so101_rig.py::test_an_arm_whose_program_is_killed_holds",),
+    "a servo of an SO-101 reports a fault": (f"{WIRE}so101_rig.py::test_a_fault_of_bus_or_motor",),
     "a motor or joint on a CAN bus": (f"{CAN}a_fault_in_motion",),
     "the process of a Robotiq gripper dies": (
         f"{WIRE}robotiq.py::test_the_gripper_keeps_its_grip_when_its_process_is_killed",

@@ -66,8 +66,8 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
 def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) -> Emulator | None:
     if driver in ("damiao", "piper"):
         return Emulator("can", ["can", *words])
-    if driver == "robotiq":
-        return Emulator("robotiq", ["robotiq", *words])
+    if driver in ("robotiq", "feetech"):
+        return Emulator(driver, [driver, *words])
     if arm.driver != driver or driver not in ("franka", "ur", "xarm"):
         return None
     options = ["--host", find_address(arm), *(words if in_world else [])]

@@ -5,6 +5,7 @@ hal emulate franka --robot fr3
 hal emulate ur --robot ur5e
 hal emulate xarm --robot xarm7
 hal emulate can --config yam_emulator
+hal emulate feetech --config so101
 hal emulate robotiq --config franka_robotiq
 """
 
@@ -22,6 +23,7 @@ DEVICES = {
     "franka": "a Franka arm and its hand",
     "ur": "a UR arm",
     "xarm": "a UFACTORY xArm",
+    "feetech": "every arm with Feetech servos of a rig",
     "robotiq": "every Robotiq gripper of a rig",
 }
 

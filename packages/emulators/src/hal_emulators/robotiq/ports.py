@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import random
 import re
 import socket
 import struct
-import termios
-import tty
-from pathlib import Path
 from time import monotonic
 
 from hal.drivers.robotiq.link import TEXT_PORT, Request, crc16
-from hal.drivers.robotiq.settings import EMULATED
+from hal_emulators.terminal import PseudoTerminal
 
 from .gripper import EmulatedGripper
 
@@ -89,30 +85,20 @@ class SerialPort(Port):
 
     def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:
         super().__init__(gripper, seed)
-        self._link = Path(str(gripper.settings.port))
-        self._ends: tuple[int, ...] = ()
-        if self._link.suffix != EMULATED or (self._link.exists() and not self._link.is_symlink()):
-            raise ValueError(
-                f"the port of an emulated gripper is a free path that ends in {EMULATED}, not {self._link}"
-            )
+        self._terminal = PseudoTerminal(str(gripper.settings.port))
 
     def open(self) -> None:
-        self._ends = os.openpty()  # while its other end is open here too, it outlives its clients
-        tty.setraw(self._ends[1])
-        self._link.unlink(missing_ok=True)
-        self._link.symlink_to(os.ttyname(self._ends[1]))
+        self._terminal.open()
 
     def close(self) -> None:
-        for end in self._ends:
-            os.close(end)
-        self._ends, self._late, self._came = (), [], {}
-        self._link.unlink(missing_ok=True)
+        self._terminal.close()
+        self._late, self._came = [], {}
 
     def descriptors(self) -> list[int]:
-        return list(self._ends[:1])
+        return self._terminal.descriptors
 
     def serve(self, descriptor: int) -> bool:
-        fcntl.ioctl(self._ends[1], termios.TIOCNXCL)  # as a driver's close would, were the end not open here too
+        self._terminal.free()
         return super().serve(descriptor)
 
     def answer(self, came: bytes) -> tuple[bytes, bytes]:
