@@ -159,9 +159,13 @@ class ArmUnit:
             return
         ahead = self.servo.answer(now, self.reading)
         self._answered = ahead is not None
+        self._note_reanchored()
         if ahead is not None:  # the device waits for it
             self._pass_on(ahead, now)
         self._setpoint = self.servo.tick(now, self.reading, self._inbox(app, said), late)
+        self._note_reanchored()
+
+    def _note_reanchored(self) -> None:
         if self.servo.report.reanchored != self._reanchored:
             self._reanchored = self.servo.report.reanchored
             self.reanchored += 1

@@ -118,6 +118,7 @@ def test_packets_that_are_lost_end_no_motion(emulator: Emulator, robot: str, str
         assert statistics["driver"]["lost_states"] > 10
         if stream != "torque":
             assert statistics["lost"] > 200
+            assert max(statistics["peak"].values()) < 1.01, "as fast as the robot's own rule goes on"
 
 
 def test_the_app_outlives_an_arm_that_is_lost(tmp_path: Path) -> None:
