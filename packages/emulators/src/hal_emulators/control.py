@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import ipaddress
 import json
 import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -151,6 +153,28 @@ def read_switch(word: str) -> bool:
     if word not in ("on", "off"):
         raise ValueError(f"takes on or off, not {word!r}")
     return word == "on"
+
+
+def read_number(word: str, least: float, most: float) -> float:
+    """Return a number in a range. Raises ValueError."""
+    value = float(word)
+    if not least <= value <= most:
+        raise ValueError(f"must be {least:g} to {most:g}, not {word}")
+    return value
+
+
+def read_end(word: str) -> float:
+    """Return the monotonic time at which a fault of so many s ends; "on" is never, "off" is now. Raises ValueError."""
+    known = {"on": 1e9, "off": 0.0}
+    return time.monotonic() + (known[word] if word in known else float(word))
+
+
+def read_loopback(text: str) -> str:
+    """Return an address, if it is one of this computer alone. Raises ArgumentTypeError."""
+    with contextlib.suppress(ValueError):
+        if ipaddress.IPv4Address(text).is_loopback:
+            return text
+    raise argparse.ArgumentTypeError(f"{text!r} is no address in 127.0.0.0/8")
 
 
 def read_words(line: str) -> list[str]:

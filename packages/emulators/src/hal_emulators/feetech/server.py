@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from hal.config.loader import load
 from hal.drivers.feetech.bus import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer, encode, split
 from hal.specs import RobotSpec
-from hal_emulators.control import read_switch
+from hal_emulators.control import read_end, read_switch
 from hal_emulators.shared_world import PRIORITY, raise_priority
 from hal_emulators.terminal import PseudoTerminal
 
@@ -33,7 +33,6 @@ _STEP = 0.002
 """Step of the mechanics, s."""
 _LONGEST_GAP = 0.25
 """Time that the mechanics make up for after the machine had no time for them, s."""
-_FOREVER = 1e9
 
 
 class ServoLine:
@@ -159,7 +158,7 @@ class FeetechEmulator:
         self.lines = {name: ServoLine(arm, seed) for name, arm in self.arms.items()}
         self._paced, self._realtime = paced, realtime
         self.lock = threading.Lock()
-        self._end = threading.Event()
+        self.read_end = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="feetech-emulator", daemon=True)
 
     def advance(self, seconds: float) -> None:
@@ -179,7 +178,7 @@ class FeetechEmulator:
         if self._realtime:
             raise_priority(PRIORITY)  # a busy computer must not look like a silent motor
         before = monotonic()
-        while not self._end.is_set():
+        while not self.read_end.is_set():
             with self.lock:
                 now = monotonic()
                 if self._paced and now - before >= _STEP:
@@ -218,7 +217,7 @@ class FeetechEmulator:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end.set()
+        self.read_end.set()
         self._thread.join(5.0)
         for line in self.lines.values():
             line.terminal.close()
@@ -233,11 +232,6 @@ class _Command(NamedTuple):
     run: Callable[[ServoLine, list[str]], dict[str, Any] | None]
 
 
-def _end(word: str) -> float:
-    """Return the time at which a fault ends."""
-    return {"on": monotonic() + _FOREVER, "off": 0.0}[word] if word in ("on", "off") else monotonic() + float(word)
-
-
 def _set(name: str, read: Callable[[str], Any]) -> Callable[[ServoLine, list[str]], None]:
     return lambda line, words: setattr(line, name, read(words[0]))
 
@@ -250,7 +244,7 @@ def _lose(line: ServoLine, words: list[str]) -> None:
 
 
 def _silence(line: ServoLine, words: list[str]) -> None:
-    line.silent_until[0 if words[0] == "all" else int(words[0])] = _end(words[1])
+    line.silent_until[0 if words[0] == "all" else int(words[0])] = read_end(words[1])
 
 
 def _twin(line: ServoLine, words: list[str]) -> None:
@@ -258,7 +252,7 @@ def _twin(line: ServoLine, words: list[str]) -> None:
 
 
 def _power(line: ServoLine, words: list[str]) -> None:
-    line.off_until = _end(words[0] if words else "0.05")
+    line.off_until = read_end(words[0] if words else "0.05")
     for servo in line.arm.servos.values():
         servo.restart()
 
@@ -309,7 +303,7 @@ COMMANDS = {
     "double": _Command("double on|off", "send each answer twice", _set("copies", lambda word: 1 + read_switch(word))),
     "spoil": _Command("spoil N", "spoil the checksum of the next N answers", _set("spoil_next", int)),
     "silent": _Command("silent ID|all S|on|off", "neither hear nor answer", _silence),
-    "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", _end)),
+    "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", read_end)),
     "power": _Command("power [S|on|off]", "a brown-out: silent for 0.05 s or S, then without torque", _power),
     "twin": _Command("twin ID on|off", "two motors have this id", _twin),
     "baud": _Command("baud N", "let the motors listen at this rate only", _set("baud", int)),

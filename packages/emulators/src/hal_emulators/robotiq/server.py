@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from hal.config.loader import load
 from hal.specs import GripperSpec
-from hal_emulators.control import read_switch
+from hal_emulators.control import read_end, read_switch
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .gripper import EmulatedGripper
@@ -29,7 +29,6 @@ _STEP = 0.002
 """Longest step of the fingers, s."""
 _LONGEST_GAP = 0.25
 """Time that the fingers make up for after the machine had no time for them, s."""
-_FOREVER = 1e9
 
 
 def find_grippers(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[GripperSpec]:
@@ -60,7 +59,7 @@ class RobotiqEmulator:
         self.worlds: dict[str, ArmInWorld] = {}
         """Places in the simulated world that the emulators of the rig share, by the name of the arm."""
         self.lock = threading.Lock()
-        self._end = threading.Event()
+        self.read_end = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="robotiq-emulator", daemon=True)
 
     def advance(self, seconds: float) -> None:
@@ -86,7 +85,7 @@ class RobotiqEmulator:
         if self._realtime:
             raise_priority(PRIORITY)  # a busy computer must not look like a silent gripper
         before = monotonic()
-        while not self._end.is_set():
+        while not self.read_end.is_set():
             with self.lock:
                 now = monotonic()
                 if self.paced:
@@ -128,7 +127,7 @@ class RobotiqEmulator:
 
     def stop(self) -> None:
         """Take all lines away."""
-        self._end.set()
+        self.read_end.set()
         if self._thread.is_alive():
             self._thread.join(5.0)
         for port in self.ports.values():
@@ -151,11 +150,6 @@ class _Command(NamedTuple):
     run: Callable[[Port, list[str]], dict[str, Any] | None]
 
 
-def _end(word: str) -> float:
-    """Return the time at which a fault ends."""
-    return {"on": monotonic() + _FOREVER, "off": 0.0}[word] if word in ("on", "off") else monotonic() + float(word)
-
-
 def _set(name: str, read: Callable[[str], Any]) -> Callable[[Port, list[str]], None]:
     return lambda port, words: setattr(port, name, read(words[0]))
 
@@ -175,7 +169,7 @@ def _lose(port: Port, words: list[str]) -> None:
 
 def _power(port: Port, words: list[str]) -> None:
     port.gripper.powered = False
-    port.gripper.on_at = _end(words[0] if words else "0.5")
+    port.gripper.on_at = read_end(words[0] if words else "0.5")
 
 
 def _state(port: Port, _: list[str]) -> dict[str, Any]:
@@ -205,8 +199,8 @@ COMMANDS = {
         lambda port, words: setattr(port.gripper, "blocked", read_switch(words[0])),
     ),
     "power": _Command("power [S|on|off]", "switch its power off for 0.5 s, for S, for good, or on again", _power),
-    "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", _end)),
-    "silent": _Command("silent S|on|off", "neither hear nor answer", _set("silent_until", _end)),
+    "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", read_end)),
+    "silent": _Command("silent S|on|off", "neither hear nor answer", _set("silent_until", read_end)),
     "late": _Command("late S", "send answers S seconds late", _set("delay", float)),
     "lose": _Command("lose P | next N", "lose that share of the answers, or exactly the next N", _lose),
     "garble": _Command("garble N", "spoil the check of the next N answers", _set("garble_next", int)),

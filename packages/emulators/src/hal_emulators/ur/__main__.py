@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
-import ipaddress
 import sys
 from collections.abc import Sequence
 
 from hal.errors import HalError
-from hal_emulators.control import CONTROL_PORT, EmulatorControl, note_signals, serve_prompt
+from hal_emulators.control import CONTROL_PORT, EmulatorControl, note_signals, read_loopback, serve_prompt
 from hal_emulators.shared_world import enter_world, find_arm
 
 from .controller import Controller
@@ -31,7 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     add = parser.add_argument
     add("--robot", choices=sorted(ROBOTS), default="ur5e", help="which arm; ur3, ur5, ur10 are CB3 (%(default)s)")
-    add("--host", default="127.0.0.1", type=_loopback, help="address to listen on; the ports are fixed (%(default)s)")
+    add(
+        "--host",
+        default="127.0.0.1",
+        type=read_loopback,
+        help="address to listen on; the ports are fixed (%(default)s)",
+    )
     add("--q", type=float, nargs=6, default=HOME, metavar="RAD", help="joint positions at the start")
     add("--payload", type=float, default=0.0, metavar="KG", help="payload of the installation")
     add(
@@ -79,12 +83,6 @@ def _serve(options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
     )
     serve_prompt(stack.enter_context(EmulatorControl(options.host)).send)
     server.run(ends)
-
-
-def _loopback(text: str) -> str:
-    if not ipaddress.IPv4Address(text).is_loopback:
-        raise ValueError
-    return text
 
 
 if __name__ == "__main__":

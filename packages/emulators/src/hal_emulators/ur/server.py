@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from hal_emulators.control import CONTROL_PORT, answer_line, read_switch
+from hal_emulators.control import CONTROL_PORT, answer_line, read_number, read_switch
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .controller import POWER_OFF, RUNNING, Controller
@@ -334,19 +334,19 @@ class UrServer:
             "safeguard": lambda: controller.set_safeguard(read_switch(values[0])),
             "power": lambda: controller.set_power(RUNNING if read_switch(values[0]) else POWER_OFF),
             "remote": lambda: controller.set_remote(read_switch(values[0])),
-            "slider": lambda: setattr(controller.motion, "scale", _number(values[0], 0.01, 1.0)),
-            "limit": lambda: setattr(controller.motion, "limit", _number(values[0], 0.01, 1.0)),
+            "slider": lambda: setattr(controller.motion, "scale", read_number(values[0], 0.01, 1.0)),
+            "limit": lambda: setattr(controller.motion, "limit", read_number(values[0], 0.01, 1.0)),
             "stuck": lambda: setattr(controller, "stuck", read_switch(values[0])),
-            "jog": lambda: controller.jog(int(_number(values[0], 0, 5)), _number(values[1], -3.0, 3.0)),
-            "push": lambda: controller.push([_number(values[k], -1e3, 1e3) for k in range(3)]),
+            "jog": lambda: controller.jog(int(read_number(values[0], 0, 5)), read_number(values[1], -3.0, 3.0)),
+            "push": lambda: controller.push([read_number(values[k], -1e3, 1e3) for k in range(3)]),
             "pause": lambda: controller.pause(read_switch(values[0])),
             "program": lambda: (
                 controller.upload(f"def {values[0]}():") if values else controller.stop_program("pendant")
             ),
-            "lose": lambda: setattr(self, "_lose", _number(values[0], 0.0, 1.0)),
-            "late": lambda: setattr(self, "_delay", _number(values[0], 0.0, 10.0)),
-            "silence": lambda: setattr(self, "_silent_until", time.monotonic() + _number(values[0], 0.0, 1e9)),
-            "cut": lambda: self._cut(_number(values[0], 0.0, 1e9)),
+            "lose": lambda: setattr(self, "_lose", read_number(values[0], 0.0, 1.0)),
+            "late": lambda: setattr(self, "_delay", read_number(values[0], 0.0, 10.0)),
+            "silence": lambda: setattr(self, "_silent_until", time.monotonic() + read_number(values[0], 0.0, 1e9)),
+            "cut": lambda: self._cut(read_number(values[0], 0.0, 1e9)),
             "refresh": self._refresh,
         }
         try:
@@ -389,10 +389,3 @@ class UrServer:
 def help_text() -> str:
     """Return the table of commands."""
     return "\n".join(f"  {name + ' ' + usage:18s} {meaning}" for name, (usage, meaning) in COMMANDS.items())
-
-
-def _number(word: str, least: float, most: float) -> float:
-    value = float(word)
-    if not least <= value <= most:
-        raise ValueError(f"must be {least:g} to {most:g}, not {word}")
-    return value

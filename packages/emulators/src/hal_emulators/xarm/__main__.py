@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
-import ipaddress
 import sys
 from collections.abc import Sequence
 
 from hal.errors import HalError
-from hal_emulators.control import CONTROL_PORT, EmulatorControl, note_signals, serve_prompt
+from hal_emulators.control import CONTROL_PORT, EmulatorControl, note_signals, read_loopback, serve_prompt
 from hal_emulators.shared_world import enter_world, find_arm
 
 from .controller import ROBOTS, Controller
@@ -30,7 +29,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     add = parser.add_argument
     add("--robot", choices=sorted(ROBOTS), default="xarm7", help="which arm (%(default)s)")
-    add("--host", default="127.0.0.1", type=_loopback, help="address to listen on; the ports are fixed (%(default)s)")
+    add(
+        "--host",
+        default="127.0.0.1",
+        type=read_loopback,
+        help="address to listen on; the ports are fixed (%(default)s)",
+    )
     add("--q", type=float, nargs="+", metavar="RAD", help="joint positions at the start")
     add("--config", metavar="RIG", help="put the arm into the simulated world of this rig (a name, or a path)")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
@@ -68,12 +72,6 @@ def _serve(options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
     )
     serve_prompt(stack.enter_context(EmulatorControl(options.host)).send)
     server.run(ends)
-
-
-def _loopback(text: str) -> str:
-    if not ipaddress.IPv4Address(text).is_loopback:
-        raise ValueError
-    return text
 
 
 if __name__ == "__main__":

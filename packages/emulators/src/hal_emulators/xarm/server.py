@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from hal_emulators.control import CONTROL_PORT, answer_line, read_switch
+from hal_emulators.control import CONTROL_PORT, answer_line, read_number, read_switch
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .controller import DT, Controller
@@ -274,19 +274,19 @@ class XArmServer:
             return self._describe()
         c = self.controller
         act: dict[str, Callable[[], object]] = {
-            "error": lambda: c.raise_error(int(_number(values[0], 1, 255))),
-            "warn": lambda: setattr(c, "warning", int(_number(values[0], 0, 255))),
+            "error": lambda: c.raise_error(int(read_number(values[0], 1, 255))),
+            "warn": lambda: setattr(c, "warning", int(read_number(values[0], 0, 255))),
             "estop": lambda: c.press(read_switch(values[0])),
-            "state": lambda: c.set_state(int(_number(values[0], 0, 6))),
-            "mode": lambda: c.take_over(int(_number(values[0], 0, 11))),
+            "state": lambda: c.set_state(int(read_number(values[0], 0, 6))),
+            "mode": lambda: c.take_over(int(read_number(values[0], 0, 11))),
             "power": lambda: c.enable(read_switch(values[0])),
-            "jog": lambda: c.jog(int(_number(values[0], 0, c.axes - 1)), _number(values[1], -3.0, 3.0)),
+            "jog": lambda: c.jog(int(read_number(values[0], 0, c.axes - 1)), read_number(values[1], -3.0, 3.0)),
             "block": lambda: setattr(c, "blocked", read_switch(values[0])),
             "nan": lambda: setattr(c, "blind", read_switch(values[0])),
-            "lose": lambda: setattr(self, "_lose", _number(values[0], 0.0, 1.0)),
-            "mute": lambda: setattr(self, "_mute_until", time.monotonic() + _number(values[0], 0.0, 1e9)),
-            "silence": lambda: setattr(self, "_silent_until", time.monotonic() + _number(values[0], 0.0, 1e9)),
-            "cut": lambda: self._cut(_number(values[0], 0.0, 1e9)),
+            "lose": lambda: setattr(self, "_lose", read_number(values[0], 0.0, 1.0)),
+            "mute": lambda: setattr(self, "_mute_until", time.monotonic() + read_number(values[0], 0.0, 1e9)),
+            "silence": lambda: setattr(self, "_silent_until", time.monotonic() + read_number(values[0], 0.0, 1e9)),
+            "cut": lambda: self._cut(read_number(values[0], 0.0, 1e9)),
             "refresh": self._refresh,
         }
         try:
@@ -330,10 +330,3 @@ class XArmServer:
 def help_text() -> str:
     """Return the table of commands."""
     return "\n".join(f"  {name + ' ' + usage:16s} {meaning}" for name, (usage, meaning) in COMMANDS.items())
-
-
-def _number(word: str, least: float, most: float) -> float:
-    value = float(word)
-    if not least <= value <= most:
-        raise ValueError(f"must be {least:g} to {most:g}, not {word}")
-    return value
