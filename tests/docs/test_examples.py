@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -46,6 +47,25 @@ def test_random_scenes_have_pictures_and_true_poses(tmp_path: Path) -> None:
     poses = json.loads((tmp_path / "here" / "scene_0.json").read_text())
     assert len(poses) == 6
     assert all(len(pose) == 7 for pose in poses.values())
+
+
+def test_what_a_policy_is_trained_on_says_how_far_the_hand_is_from_the_cube_and_the_cube_from_its_goal() -> None:
+    """``train_pick_cube.py`` itself needs Stable-Baselines3 and half an hour."""
+    env = runpy.run_path(str(EXAMPLES / "train_pick_cube.py"))["make"]()
+    seen, _ = env.reset(seed=1000)
+    first, terminated = seen, False
+    for action in env.unwrapped.solve():
+        seen, _, terminated, truncated, info = env.step(action)
+        assert env.observation_space.contains(seen)
+        assert not truncated, info
+        if terminated:
+            break
+    env.close()
+    assert terminated
+    hand, goal = np.linalg.norm(first[:3]), np.linalg.norm(first[3:6])
+    assert hand > 0.05 > 0.025 > np.linalg.norm(seen[:3])
+    assert goal > 0.05 > 0.025 > np.linalg.norm(seen[3:6])
+    assert abs(seen[9]) < 0.05, "the fingers are along the cube's sides"
 
 
 def test_an_arm_of_ones_own_goes_up(tmp_path: Path) -> None:
