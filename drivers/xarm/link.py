@@ -33,6 +33,8 @@ PERIOD = 0.01
 _REPORT = struct.Struct("<BH20f")
 """State and mode, commands that wait, 7 angles (rad), pose (mm, rad), 7 torques (Nm); after the size (big endian)."""
 _LONGEST_REPORT = 4096
+_READS = 16
+"""Most reads of the line at a time: what sends without a pause must not keep the cycle."""
 _POLL = 0.05
 """Time between two questions for errors while no set-points are sent, s."""
 _WATCH = 0.5
@@ -159,7 +161,7 @@ class ReportLine:
         if self._line is None:
             raise OSError("it is closed")
         with contextlib.suppress(BlockingIOError):
-            while True:
+            for _ in range(_READS):
                 news = self._line.recv(1 << 16)
                 if not news:
                     raise OSError("it hung up")

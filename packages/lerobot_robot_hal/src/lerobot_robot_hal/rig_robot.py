@@ -39,7 +39,7 @@ LEAD = (0.03, 0.12)
 LONGEST_STEP = 0.1
 """Longest time for which a pad's velocity moves the goal at once, s."""
 _POLL = 0.005
-"""Time between two looks at the dead-man and the servo, s."""
+"""Time between two looks at the dead-man, the servo, or a state that is late, s."""
 _log = logging.getLogger("lerobot_robot_hal")
 
 
@@ -221,6 +221,7 @@ class RigRobot:
             except StaleStateError:
                 if rig.clock.now() > end:
                     raise
+                rig.clock.sleep(_POLL)
 
     def read_pad(self) -> dict[str, float]:
         """Return the action that the pad wants; the other arms stay where they are."""
