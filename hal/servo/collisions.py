@@ -357,7 +357,8 @@ class _Surroundings:
         """Measure the joints' ways by vectors: joint j goes at most ``scale[j] * vector[j]``, in rad, for each."""
         self._scales = np.array(scales)
         self.shares = [inf] * len(scales)
-        self._weights, self._turned, self.left = [inf] * len(self._at), inf, -inf
+        self._weights, self._turned, self._per_turn = [inf] * len(self._at), inf, inf
+        self.left = -inf
 
     def is_clear(self, q: Floats, taken: float) -> bool:
         """Return whether no pair can get near from ``q`` (n,) on ways that take this share of the room."""
@@ -371,7 +372,7 @@ class _Surroundings:
                 return False
             turned = sum([w * abs(x - x0) for w, x, x0 in zip(self._weights, q, self._at, strict=True)])
             left = room - turned
-            if taken > left:
+            if not taken <= left:  # NaN too
                 return False
             self._later, self._turned = tuple(q), turned
         self.last, self.left = q, left
