@@ -144,9 +144,11 @@ class PairBounds:
         self.distances: Array = np.full(model.count, -np.inf)
         """Distances (pairs,), m, at the positions where each was computed last: of the pairs that :meth:`near` returns,
         those at its ``q``."""
+        self.shares: Array = np.full((model.count, model.n), np.inf)
+        """(pairs, n), 1/rad: no pair gets under the ``least`` of the last call of :meth:`near` as long as the turns of
+        the joints since the positions of that call, times its row, make less than 1 together."""
         self.weights: Array = np.full(model.n, np.inf)
-        """(n,), 1/rad: no pair gets under the ``least`` of the last call of :meth:`near` as long as the turns of the
-        joints since the positions of that call, times these, make less than 1 together."""
+        """The greatest share of each joint (n,), 1/rad: as good as the row of any pair."""
         self._at: Array = np.zeros((model.count, model.n))
         """Joint positions (pairs, n) at which each distance was computed, rad."""
         self._reserve: Array = _RESERVE * model.levers.sum(axis=1)
@@ -170,8 +172,10 @@ class PairBounds:
             self._compute(q, low, bounds)
         rooms = bounds - least
         if rooms.min(initial=np.inf) > 0.0:
-            self.weights = (levers / rooms[:, np.newaxis]).max(axis=0, initial=0.0)
+            self.shares = levers / rooms[:, np.newaxis]
+            self.weights = self.shares.max(axis=0, initial=0.0)
         else:
+            self.shares = np.full(levers.shape, np.inf)
             self.weights = np.full(self.model.n, np.inf)
         near: list[int] = np.flatnonzero(bounds < needed).tolist()
         return near

@@ -345,8 +345,8 @@ class _Surroundings:
         self.shares: list[float] = []
         """The share of all room that the length of each vector of :meth:`measure_ways` takes at most."""
         self._weights, self._turned, self._per_turn = [inf] * n, inf, inf
-        """The share of the room that each rad of each joint takes (n,); that the turns from the computed positions to
-        some later ones have taken; and that each rad of the joints together takes."""
+        """The share of any pair's room that each rad of each joint takes at most (n,); that the turns from the computed
+        positions to some later ones have taken; and that each rad of the joints together takes."""
         self._at: Floats = (0.0,) * n
         self._later: Floats = self._at
         self._others_at: list[tuple[Neighbour, Floats, float]] = []
@@ -370,7 +370,7 @@ class _Surroundings:
         if not taken <= left:
             if self._per_turn == inf:
                 return False
-            turned = sum([w * abs(x - x0) for w, x, x0 in zip(self._weights, q, self._at, strict=True)])
+            turned = float(self.bounds.shares[:, self.own].dot(np.abs(np.subtract(q, self._at))).max(initial=0.0))
             left = room - turned
             if not taken <= left:  # NaN too
                 return False
