@@ -164,7 +164,7 @@ class CollisionGuard:
         if not near:
             return dq
         before = around.bounds.distances[near]
-        fastest = around.model.levers[near, around.own] @ np.abs(dq)
+        fastest = around.model.levers[near][:, around.own].dot(np.abs(dq))
         greatest = float(fastest.max())
         if greatest <= 0.0:
             return dq
@@ -290,7 +290,7 @@ class CollisionGuard:
         around = self._around
         taken = around.approach_of_others(pairs)
         least = around.model.margins[pairs] - _TOLERANCE
-        own = around.model.levers[pairs, around.own]
+        own = around.model.levers[pairs][:, around.own]
 
         def look(u: float) -> tuple[float, Array]:
             return u, np.array(around.lowest(pairs, [stop.at(u)]))
@@ -370,7 +370,7 @@ class _Surroundings:
         if not taken <= left:
             if self._per_turn == inf:
                 return False
-            turned = float(self.bounds.shares[:, self.own].dot(np.abs(np.subtract(q, self._at))).max(initial=0.0))
+            turned = float(np.abs(np.subtract(q, self._at)).dot(self.bounds.shares[self.own]).max(initial=0.0))
             left = room - turned
             if not taken <= left:  # NaN too
                 return False
@@ -403,6 +403,8 @@ class _Surroundings:
 
     def approach_of_others(self, pairs: Sequence[int]) -> Array:
         """Return how much nearer (pairs,), m, the shapes come at most while the other arms stop."""
+        if not self._others:
+            return np.zeros(len(pairs))
         levers, own = self.model.levers[pairs], self.own
         taken: Array = levers @ self._ways - levers[:, own] @ self._ways[own]
         return taken
