@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from hal_emulators.network_arm import NetworkController
+
 from .motion import ROBOTS, TargetMotion, forward, parameters
 
 __all__ = ["POWER_OFF", "RUNNING", "Controller"]
@@ -35,16 +37,15 @@ _PROGRAM_STOP, _PROTECTIVE_DECELERATION = 8.0, 30.0
 """Deceleration of a program that ends, and of a protective stop, rad/s2; chosen."""
 
 
-class Controller:
+class Controller(NetworkController):
     """One controller with its arm. ``step`` lets a cycle pass."""
 
     def __init__(self, robot: str, q: Sequence[float], payload: float, tcp: Sequence[float]) -> None:
         self.robot, self.dh = robot, parameters(robot)
         self.rate = ROBOTS[robot][2]
-        self.dt = 1.0 / self.rate
+        super().__init__(1.0 / self.rate)
         self.motion = TargetMotion(q, self.dt)
         self.version = (5, 15, 0, 0) if self.rate == 500 else (3, 15, 0, 0)
-        self.now = 0.0
         self.remote = True
         self.robot_mode, self.safety_mode = RUNNING, NORMAL
         self.payload, self.cog, self.tcp = payload, [0.0] * 3, list(tcp)
@@ -61,8 +62,6 @@ class Controller:
         self.stuck = False
         """Whether it ignores set-points of ``servoj``."""
         self.offset = 0
-        self.events: list[str] = []
-        """What happened, the newest last."""
         self._starts: tuple[float, str, int] | None = None
         self._watchdog: float | None = None
         self._t_written = self._t_protective = 0.0
@@ -70,9 +69,9 @@ class Controller:
         """Whether the command that blocks the script is over."""
         self._executing = False
 
-    def note(self, event: str) -> None:
-        """Keep an event, with its time."""
-        self.events = [*self.events[-49:], f"{self.now:.3f} {event}"]
+    @property
+    def joints(self) -> Sequence[float]:
+        return self.motion.actual_q
 
     # Programs.
 

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hal_emulators.network_arm import NetworkController
+
 __all__ = ["DT", "ROBOTS", "Controller", "Robot"]
 
 Floats = list[float]
@@ -78,15 +80,15 @@ ROBOTS = {
 """UFACTORY's "Kinematic and Dynamic Parameters" (ufactory_docs), and the SDK's ``XCONF.Robot``."""
 
 
-class Controller:
+class Controller(NetworkController):
     """One controller with its arm. ``step`` lets a cycle pass. Joint positions are of the arm's joints, rad."""
 
     def __init__(self, robot: str, q: Sequence[float]) -> None:
+        super().__init__(DT)
         self.robot, self.arm = robot, ROBOTS[robot]
         self.axes = len(self.arm.rows)
         if len(q) != self.axes:
             raise ValueError(f"an {robot} has {self.axes} joints, not {len(q)}")
-        self.now = 0.0
         self.mode, self.error, self.warning = POSITION, 0, 0
         self.enabled = False
         """Whether the motors are switched on."""
@@ -98,8 +100,6 @@ class Controller:
         """Whether the first joint is reported as not a number."""
         self.blocked = False
         """Whether something holds the joints."""
-        self.events: list[str] = []
-        """What happened, the newest last."""
         self.set_points = 0
         """Number of set-points that were executed."""
         self._halted = STOPPED
@@ -107,9 +107,9 @@ class Controller:
         self.q, self.dq = list(q), [0.0] * self.axes
         self.hold()
 
-    def note(self, event: str) -> None:
-        """Keep an event, with its time."""
-        self.events = [*self.events[-49:], f"{self.now:.3f} {event}"]
+    @property
+    def joints(self) -> Sequence[float]:
+        return self.q
 
     @property
     def state(self) -> int:
