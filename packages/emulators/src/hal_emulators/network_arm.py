@@ -104,6 +104,8 @@ class NetworkArm:
         self.host, self.controller = host, controller
         self.world: ArmInWorld | None = None
         """The simulated world that the arm is in."""
+        self.has_gripper = False
+        """Whether the rig of that world has a gripper at this controller."""
         self.lost = 0
         """Number of states that were left out."""
         self._random = random.Random(seed)
@@ -139,7 +141,7 @@ class NetworkArm:
                 due = time.monotonic()
             self.controller.step()
             if self.world is not None:
-                self.world.exchange(dt, self.controller.joints)
+                self.exchange(self.world)
             now = time.monotonic()
             if now >= self._silent_until:
                 while self._late and self._late[0][0] <= now:
@@ -153,6 +155,10 @@ class NetworkArm:
         self._selector.close()
 
     # Of a kind of controller.
+
+    def exchange(self, world: ArmInWorld) -> None:
+        """Tell the world where the arm is."""
+        world.exchange(self.controller.dt, self.controller.joints)
 
     def greet(self, client: Client) -> None:
         """Send what a new client gets first."""
@@ -340,6 +346,7 @@ def run_program(
             if options.config is not None:
                 arm = find_arm(options.config, options.set, driver, options.host)
                 server.world = enter_world(stack, options.config, options.set, arm)
+                server.has_gripper = arm.gripper is not None and arm.gripper.driver == driver
             gc.freeze()
             print(
                 f"ready: {options.robot} at {options.host}, {describe(server)}, control {options.host}:{CONTROL_PORT}",

@@ -61,6 +61,8 @@ class Controller(NetworkController):
         """What pushes the arm, N and Nm in the controller's base."""
         self.stuck = False
         """Whether it ignores set-points of ``servoj``."""
+        self.jump = 0.0
+        """By how much the next one is off, rad."""
         self.offset = 0
         self._starts: tuple[float, str, int] | None = None
         self._watchdog: float | None = None
@@ -118,6 +120,13 @@ class Controller(NetworkController):
             self.note(f"protective stop: {why}")
             self.safety_mode, self._t_protective = PROTECTIVE_STOP, time.monotonic()
             self.stop_program("protective stop")
+            self.motion.stop(_PROTECTIVE_DECELERATION)
+
+    def set_safety(self, mode: int) -> None:
+        """Be in a mode of the safety system; 4, 8 and 9 are recovery, violation and fault, 6 the system's stop."""
+        self.safety_mode = mode
+        if mode != NORMAL:
+            self.stop_program(f"safety mode {mode}")
             self.motion.stop(_PROTECTIVE_DECELERATION)
 
     def stop_emergency(self, pressed: bool) -> None:
@@ -261,7 +270,8 @@ class Controller(NetworkController):
             if not self.inputs.get(f"input_int_register_{self.offset + 1}", 0):
                 self._busy = lambda: motion.at_rest
         elif command == 11 and not self.stuck:  # servoj
-            motion.servo(x(0, 6), *x(9))
+            motion.servo([value + self.jump for value in x(0, 6)], *x(9))
+            self.jump = 0.0
         elif command == 9:  # speedj
             motion.speed(x(0, 6), *x(6))
         elif command in (15, 16, 33, 34):  # speed_stop, servo_stop, stopl, stopj
@@ -296,7 +306,7 @@ class Controller(NetworkController):
             "safety_mode": self.safety_mode,
             "safety_status": self.safety_mode,
             "robot_status_bits": (self.robot_mode == RUNNING) | (2 if self.program else 0),
-            "safety_status_bits": _SAFETY_BITS[self.safety_mode],
+            "safety_status_bits": _SAFETY_BITS.get(self.safety_mode, 0),
             "runtime_state": PAUSED if self.paused else PLAYING if self.program else STOPPED,
             "speed_scaling": motion.scale * motion.limit,
             "target_speed_fraction": motion.scale,

@@ -16,6 +16,8 @@ import numpy as np
 
 from hal_emulators.network_arm import NetworkController
 
+from .gripper import Gripper
+
 __all__ = ["DT", "ROBOTS", "Controller", "Robot"]
 
 Floats = list[float]
@@ -90,6 +92,7 @@ class Controller(NetworkController):
         if len(q) != self.axes:
             raise ValueError(f"an {robot} has {self.axes} joints, not {len(q)}")
         self.mode, self.error, self.warning = POSITION, 0, 0
+        self.gripper = Gripper()
         self.enabled = False
         """Whether the motors are switched on."""
         self.pressed = False
@@ -98,6 +101,8 @@ class Controller(NetworkController):
         """Mass, kg, and its centre, mm."""
         self.blind = False
         """Whether the first joint is reported as not a number."""
+        self.jump = 0.0
+        """By how much the next set-point is off, rad."""
         self.blocked = False
         """Whether something holds the joints."""
         self.set_points = 0
@@ -207,6 +212,7 @@ class Controller(NetworkController):
         if not self.ready or self.mode != SERVO:
             return False
         now = time.monotonic()
+        q, self.jump = [value + self.jump for value in q], 0.0
         self._course.append((min(max(now - self._t_set, _SHORTEST), _LONGEST), list(q)))
         self._t_set = now
         took = sum(dt for dt, _ in list(self._course)[1:])
@@ -231,6 +237,7 @@ class Controller(NetworkController):
     def step(self) -> None:
         """Let a cycle pass."""
         self.now += DT
+        self.gripper.step(DT)
         if self._goal is not None:
             self._plan()
         share, most = 0.0 if self.blocked else 1.0 - math.exp(-DT / _LAG), math.pi * DT

@@ -13,8 +13,10 @@ from typing import Any, ClassVar
 from hal_emulators import network_arm
 from hal_emulators.control import read_number, read_switch
 from hal_emulators.network_arm import Act, Client, NetworkArm
+from hal_emulators.shared_world import ArmInWorld
 
 from .controller import DT, Controller
+from .gripper import Gripper
 
 __all__ = ["COMMANDS", "ORDERS", "XArmServer"]
 
@@ -23,15 +25,20 @@ ORDERS, NORMAL, RICH, REAL = 502, 30001, 30002, 30003
 _PERIODS = {NORMAL: 0.2, RICH: 0.2, REAL: 0.01}
 """Port -> time between two reports, s."""
 VERSION = "v2.5.0"
+FORCE = 30.0
+"""Of the gripper, N."""
 
 COMMANDS = {
     "error": ("NUMBER", "stop with an error of the controller, as 31 (collision)"),
     "warn": ("NUMBER", "a warning; 0 for none"),
+    "jump": ("RAD", "take the next set-point so far away"),
     "estop": ("on|off", "press or release the emergency stop"),
     "state": ("NUMBER", "as another program: 3 pauses, 4 stops"),
     "mode": ("NUMBER", "as another program: take over in this mode, as 0 (position) or 2 (by hand)"),
     "power": ("on|off", "switch the motors on or off"),
     "jog": ("JOINT RAD", "move a joint (0 to 6) by hand"),
+    "object": ("M|none", "put an object of this width between the gripper's fingers"),
+    "gripper": ("NUMBER|on|off|block", "an error of the gripper, 0 for none; unplug it; hold its fingers"),
     "block": ("on|off", "hold the joints, as an obstacle would"),
     "nan": ("on|off", "report a joint as not a number"),
     **network_arm.COMMANDS,
@@ -84,12 +91,18 @@ class XArmServer(NetworkArm):
         if register in act:
             act[register]()
             return b""
+        if register == 124:  # RS485_RTU: of the line at the flange
+            reply = c.gripper.answer(data[1:])
+            if reply is None:
+                c.raise_error(19)
+            return data[:1] + reply if reply is not None else None
         find: dict[int, Callable[[], bytes]] = {
             1: lambda: f"{c.axes},{c.arm.kind},XI1304,AC1304,{VERSION}".encode().ljust(40, b"\0"),
             13: lambda: bytes([c.state]),
             14: lambda: struct.pack(">H", 0),
             15: lambda: bytes([c.error, c.warning]),
             41: lambda: struct.pack("<6f", *c.forward(c.q)),
+            128: lambda: struct.pack(">i", 11 if data[1:3] == b"\x0a\x0b" else 0),  # rate of that line: 2 Mbit/s
             42: lambda: struct.pack("<21f", *self._pad(c.q), *self._pad(c.dq), *[0.0] * 7)[: 28 * (data or b"\1")[0]],
         }
         return find[register]() if register in find else None
@@ -136,14 +149,33 @@ class XArmServer(NetworkArm):
         return {
             "error": lambda words: c.raise_error(int(read_number(words[0], 1, 255))),
             "warn": lambda words: setattr(c, "warning", int(read_number(words[0], 0, 255))),
+            "jump": lambda words: setattr(c, "jump", read_number(words[0], -3.0, 3.0)),
             "estop": lambda words: c.press(read_switch(words[0])),
             "state": lambda words: c.set_state(int(read_number(words[0], 0, 6))),
             "mode": lambda words: c.take_over(int(read_number(words[0], 0, 11))),
             "power": lambda words: c.enable(read_switch(words[0])),
             "jog": lambda words: c.jog(int(read_number(words[0], 0, c.axes - 1)), read_number(words[1], -3.0, 3.0)),
+            "object": lambda words: setattr(c.gripper, "object_width", None if words[0] == "none" else float(words[0])),
+            "gripper": lambda words: self._disturb(c.gripper, words[0]),
             "block": lambda words: setattr(c, "blocked", read_switch(words[0])),
             "nan": lambda words: setattr(c, "blind", read_switch(words[0])),
         }
+
+    @staticmethod
+    def _disturb(gripper: Gripper, word: str) -> None:
+        if word == "block":
+            gripper.blocked = True
+        elif word in ("on", "off"):
+            gripper.connected, gripper.blocked = word == "on", False
+        else:
+            gripper.fail(int(read_number(word, 0, 255)))
+
+    def exchange(self, world: ArmInWorld) -> None:
+        gripper = self.controller.gripper
+        if self.has_gripper:
+            gripper.object_width = world.object_width
+            world.fingers = (world.now_of_fingers, gripper.width, FORCE if gripper.holds else 0.0)
+        super().exchange(world)
 
     def renew(self) -> Controller:
         new = Controller(self.controller.robot, self._home)
@@ -162,4 +194,7 @@ class XArmServer(NetworkArm):
             "enabled": c.enabled,
             "load": c.load,
             "set_points": c.set_points,
+            "width": c.gripper.width,
+            "speed": c.gripper.speed,
+            "gripper_on": c.gripper.enabled,
         }
