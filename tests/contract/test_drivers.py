@@ -248,6 +248,17 @@ class TestEmulatedRobotiq(GripperContract, left_out={"freeze": "a gripper that d
 
 
 @pytest.mark.slow
+@pytest.mark.alone
+class TestEmulatedXarmGripper(GripperContract, left_out={"freeze": "a gripper that does not answer is lost"}):
+    """The driver and xarm-python-sdk against the emulator, in real time."""
+
+    @pytest.fixture
+    def bench(self, xarm7: XArm7) -> Iterator[GripperBench]:
+        with xarm7.gripper() as bench:
+            yield bench
+
+
+@pytest.mark.slow
 class TestEmulatedFrankaHand(GripperContract):
     bench = bench_of(franka_hand)
 
