@@ -396,10 +396,10 @@ class TeleopSession:
         self._arm = arm
         state = arm.pad.state()
         fresh, arm.seen = state.stamp.seq != arm.seen, state.stamp.seq
-        motion, grip = arm.teleop.step(state, dt)
-        if arm.held_for:
-            motion, grip = STILL, None
         try:
+            motion, grip = arm.teleop.command(state, dt)
+            if arm.held_for:
+                motion, grip = STILL, None
             motion = arm.follow_gizmo(motion, self.rig.viewer3d)
             control.send(motion, grip=grip, t_event=state.stamp.t if fresh else 0.0)
             arm.note_resumed()
