@@ -178,4 +178,6 @@ def make_teleop(robot: Robot, pad: Gamepad, mapping: str | Path | TeleopMapping,
 
 def explain_leads(spec: LeaderSpec) -> str:
     """Return which arms a leader leads."""
-    return f"{spec.title} leads {', '.join(spec.leads)} joint to joint, and its model has no `arm` to lead others by poses"
+    return (
+        f"{spec.title} leads {', '.join(spec.leads)} joint to joint, and its model has no `arm` to lead others by poses"
+    )
