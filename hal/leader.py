@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from .deadman import Deadman, Threshold
 from .driver import GamepadDriver, PadReading
 from .errors import HalError
-from .gamepad import Gamepad
+from .gamepad import RUMBLE_SECONDS, RUMBLE_STRONG, RUMBLE_WEAK, Gamepad
 
 if TYPE_CHECKING:
     import threading
@@ -87,6 +87,7 @@ class LeaderDriver(GamepadDriver):
         self.is_open, self._retry_at = True, -math.inf
 
     def poll(self, now: float, timeout: float) -> PadReading:
+        """Return the present state; in real time 100 times a second."""
         if timeout > 0.0:
             wait = min(max(0.0, self._due - monotonic()), timeout)
             sleep(wait)
@@ -148,18 +149,22 @@ class LeaderDriver(GamepadDriver):
 
     @property
     def mapping(self) -> str | None:
+        """Name of the mapping for its buttons."""
         return "leader"
 
     @property
     def control_names(self) -> Mapping[str, str]:
+        """Names of its own controls."""
         held = "the lever" if self.leader.lever == "deadman" else "the moving leader"
         return {"l2": held, "r2": "the lever"}
 
     def describe(self) -> str:
+        """Return what it is and where, or why it is not there."""
         where = f"{self.leader.title} at {self.spec.options.get('port', 'no port')}"
         return f"no {where}: {self._trouble}" if self._trouble else where
 
     def close(self) -> None:
+        """Release the leader."""
         if self.is_open:
             self.is_open = False
             self._lose(self._reading.t, "it is not open")
@@ -183,6 +188,7 @@ class Leader(Gamepad):
         """Dead-men of the gamepad, and those of the leader that follow them."""
 
     def state(self) -> PadState:
+        """Return the newest state of the leader, with the buttons of its gamepad; never waits."""
         own, name = super().state(), self._lever
         if self.guard is None:
             return own
@@ -193,6 +199,7 @@ class Leader(Gamepad):
         return replace(own, axes=MappingProxyType(dict(axes)), buttons=buttons, connected=connected)
 
     def wake(self, event: threading.Event) -> None:
+        """Set an event whenever the leader or its gamepad changes."""
         super().wake(event)
         if self.guard is not None:
             self.guard.wake(event)
@@ -224,24 +231,31 @@ class Leader(Gamepad):
         self._pass_on()
 
     def distrust(self) -> str | None:
+        """Return why it must not lead a real arm at the moment, with the remedy; None if it may."""
         if self.driver.simulated or self.spec.emulated:
             return f"{self.driver.describe()} cannot lead a real arm: no person holds it"
         if not self.spec.may_drive_real:
             return explain_unguarded(self.name)
         return self.guard.distrust() if self.guard is not None and self.spec.deadman else super().distrust()
 
-    def rumble(self, *, strong: float = 1.0, weak: float = 0.5, seconds: float = 0.5) -> bool:
+    def rumble(
+        self, *, strong: float = RUMBLE_STRONG, weak: float = RUMBLE_WEAK, seconds: float = RUMBLE_SECONDS
+    ) -> bool:
+        """Start the motors of its gamepad; False without one."""
         return self.guard is not None and self.guard.rumble(strong=strong, weak=weak, seconds=seconds)
 
     @property
     def can_hold(self) -> bool:
+        """Whether its dead-man can be held down."""
         return self.guard is None or not self.spec.deadman or self.guard.can_hold
 
     @property
     def finished(self) -> bool:
+        """Whether its gamepad is a recording that has come to its end."""
         return self.guard is not None and self.guard.finished
 
     def control_name(self, control: str) -> str:
+        """Return the name of a control, as printed on its gamepad."""
         theirs = self.guard is not None and control != self._lever
         return self.guard.control_name(control) if self.guard and theirs else super().control_name(control)
 

@@ -77,11 +77,13 @@ class LeaderTeleop(Teleop):
         self._anchor = None
 
     def prepare_takeover(self) -> None:
+        """Engage by the mapping's ``take_over`` instead of the dead-man. Raises CommandError if there is none."""
         if self.mapping.take_over is None:
             raise CommandError("this mapping has no button take_over, with which a leader takes over", code="no_button")
         self.button = self.mapping.take_over
 
     def is_touched(self, pad: PadState) -> bool:
+        """Return whether the button that engages it is pressed."""
         return pad.pressed(self.button)
 
     def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
@@ -116,6 +118,7 @@ class LeaderTeleop(Teleop):
         return _JointAnchor(np.array(joints), state.q_set, speed * np.array(self.robot.limits.velocity))
 
     def help(self, pad: Gamepad) -> list[str]:
+        """Return how the arm follows, and what the controls do, in lines of text."""
         how = "by the pose of its tcp" if self._kinematics is not None else "joint to joint"
         return [f"{self.robot.name} follows {self.spec.title} {how}", *super().help(pad)]
 

@@ -103,8 +103,9 @@ class DriverSpec:
     """A few words for :attr:`pad_input`, for status messages."""
     checks: Mapping[str, str] = field(default_factory=dict)
     """Kind of device (``robot``, ``gripper``, ``camera``, ``gamepad``, ``leader``) -> "module:function", which checks
-    the resolved record of such a device before anything is opened. It yields (key, message, code) for each mistake; keys are
-    relative to the device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
+    the resolved record of such a device before anything is opened. It yields (key, message, code) for each mistake;
+    keys are relative to the device's entry in the rig, for example ``real.host``. It must not import the driver's
+    libraries."""
     emulated: str | None = None
     """"module:function" that returns whether the options of a real device name an emulator on this computer."""
     steppable: bool = True

@@ -520,10 +520,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     lock_step = plan.clock == "lock_step"
     known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
-    if plan.attended and not plan.emulated:
-        for spec in (chosen.spec for chosen in pads):
-            if spec.leader is not None and not spec.leader.may_drive_real:
-                raise NotSupported(explain_unguarded(spec.name), code="deadman_not_trusted")
+    _check_leaders(plan, pads)
     pages = [chosen for chosen in pads if chosen.input == "console"]
     for chosen in pages[1:]:
         note = "the page is one pad, and drives one arm at a time; for the other one, plug in a gamepad"
@@ -550,6 +547,14 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
             )
         registry.load(registry.provider("console"), "console")
     return pads
+
+
+def _check_leaders(plan: Plan, pads: Sequence[Chosen]) -> None:
+    """Refuse a leader without a dead-man where something real moves. Raises NotSupported."""
+    for chosen in pads:
+        leader = chosen.spec.leader
+        if leader is not None and not leader.may_drive_real and plan.attended and not plan.emulated:
+            raise NotSupported(explain_unguarded(chosen.spec.name), code="deadman_not_trusted")
 
 
 class Devices(dict[str, T]):

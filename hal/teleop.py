@@ -328,10 +328,17 @@ class ArmTeleop:
         mapping: Name or file of the mapping; None for the one that the plugged-in pad is meant for.
         speed: Share of the mapping's speeds, above 0, at most 1.
         announce: Gets every event.
+        make: Returns what turns the pad's states into commands, for an arm, a pad, a mapping and a speed.
     """
 
     def __init__(
-        self, robots: Sequence[Robot], pad: Gamepad, mapping: str | None, speed: float, announce: Announce
+        self,
+        robots: Sequence[Robot],
+        pad: Gamepad,
+        mapping: str | None,
+        speed: float,
+        announce: Announce,
+        make: Callable[[Robot, Gamepad, str, float], Teleop],
     ) -> None:
         self.robots = tuple(robots)
         self.robot = self.robots[0]
@@ -352,7 +359,7 @@ class ArmTeleop:
         """Number of the pad's newest event that was turned into a command."""
         self.mapping = ""
         """Name or file of the mapping that is used."""
-        self._mapping_wanted, self._speed, self._announce = mapping, speed, announce
+        self._mapping_wanted, self._speed, self._announce, self._make = mapping, speed, announce, make
         self.load_mapping()
 
     def announce(self, text: str, kind: SessionEventKind, reason: str = "") -> None:
@@ -377,10 +384,8 @@ class ArmTeleop:
 
     def load_mapping(self) -> None:
         """Use the mapping that is due. Its dead-man must be released and pressed before it counts."""
-        from .leading import make_teleop
-
         self.mapping = self.choose_mapping()
-        self.teleop = make_teleop(self.robot, self.pad, self.mapping, self._speed)
+        self.teleop = self._make(self.robot, self.pad, self.mapping, self._speed)
         self.deadman = self.pad.hold(self.teleop.mapping.deadman)
 
     def other_pad_ready(self) -> bool:

@@ -66,8 +66,8 @@ class FeetechLeader(LeaderDriver):
             states = chain.read(now)
             holding = [label for label, state in zip(chain.labels.values(), states, strict=True) if state.on]
             if holding:
-                text = f"{', '.join(holding)} has torque, and cannot be moved by hand: this may be a follower; if it is not"
-                raise ConnectionLost(f"{text}, switch its supply off and on", code="has_torque")
+                text = f"{', '.join(holding)} has torque: this may be a follower; if not, switch its supply off and on"
+                raise ConnectionLost(text, code="has_torque")
         except BaseException:
             chain.close()
             raise

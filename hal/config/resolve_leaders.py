@@ -6,12 +6,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 from .. import registry
-from ..errors import ConfigError
 from ..specs import Floats, KinematicsSpec, LeaderSpec, PadSpec
 from .context import Context, is_emulated
 from .files import find_file, read_yaml, suggest, validate
 from .models import LeaderModel
-from .rigfile import LeaderConfig
+from .resolve_robots import resolve_robot
+from .rigfile import LeaderConfig, RobotConfig
 from .schema import Unknown
 
 
@@ -94,8 +94,6 @@ def _make_leader(context: Context, key: str, config: LeaderConfig, model: Leader
 
 def _find_kinematics(context: Context, key: str, config: LeaderConfig, model: LeaderModel) -> KinematicsSpec | None:
     """Return the leader's own kinematics if an arm of the rig needs them; add a problem if there are none."""
-    from .loader import load  # which resolves rigs with leaders
-
     robots = context.rig.robots
     driven = [robots[config.drives]] if config.drives in robots else list(robots.values())
     others = [robot.model for robot in driven if robot.model not in model.leads]
@@ -108,9 +106,7 @@ def _find_kinematics(context: Context, key: str, config: LeaderConfig, model: Le
     if config.engage == "approach":
         message = f"{others[0]} is led by poses, of which only the changes count: use clutch"
         context.report(f"{key}.engage", message, "conflict")
-    try:
-        return load({"robots": {"leader": {"model": model.arm}}}, driver="mock").resolve().robots[0].kinematics
-    except ConfigError as error:
-        for problem in error.problems:
-            context.problems.add(problem.file, problem.key, problem.message, problem.code)
-        return None
+    driver = registry.pad_driver("program")
+    own = Context(context.source, context.base, context.rig, None, driver, None, context.problems)
+    arm = resolve_robot(own, "leader", RobotConfig(model=model.arm))
+    return None if arm is None else arm.kinematics

@@ -11,10 +11,10 @@ import pytest
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
 from app_kit import CROSS, PS, run_here, write_pad
-from hal_emulators.feetech.server import FeetechEmulator, find_leaders
 
 from hal.apps import collect, replay
 from hal.recording import Dataset
+from hal_emulators.feetech.server import FeetechEmulator, find_leaders
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 

@@ -19,8 +19,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
     parser = argparse.ArgumentParser(
         prog="hal emulate feetech",
-        description="Emulates every arm and leader with Feetech servos of a rig, on a pseudo terminal with the name of its port, "
-        "with mass, gravity and friction. What the manuals leave open is assumed; it proves nothing about a real arm.",
+        description="Emulates every arm and leader with Feetech servos of a rig, on a pseudo terminal with the name of "
+        "its port, with mass, gravity and friction. What the manuals leave open is assumed; it proves nothing about a "
+        "real arm.",
         epilog="commands, typed here or sent to the control port; with several arms, the arm's name first:\n"
         + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
