@@ -284,7 +284,7 @@ def check_everything(plan: Plan, args: argparse.Namespace) -> None:
     for camera in plan.cameras:
         registry.load(camera.driver, "camera")
     for chosen in pads:
-        registry.load(chosen.spec.driver, "gamepad")(chosen.spec)  # checks its options; opens nothing
+        registry.load(chosen.spec.driver, chosen.spec.kind)(chosen.spec)  # checks its options; opens nothing
 
 
 def _world_warnings(plan: Plan) -> list[str]:

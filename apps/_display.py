@@ -33,12 +33,12 @@ def banner(rig: Rig) -> str:
     plan = rig.plan
     lines = [f"rig      {plan.source}"]
     for line in list_devices(plan):
-        if line.startswith("gamepad"):
+        if line.startswith(("gamepad", "leader")):
             continue
         lines.append(line)
         if line.startswith("world") and rig.renderer:
             lines.append(f"renderer {rig.renderer}")
-    lines.extend(f"gamepad  {pad.name:10s} {pad.describe()}" for pad in rig.gamepads.values())
+    lines.extend(f"{pad.driver.spec.kind:8s} {pad.name:10s} {pad.describe()}" for pad in rig.gamepads.values())
     lines.extend(f"note     {note}" for note in rig.notes)
     return "\n".join(f"  {line}" for line in lines)
 
@@ -62,7 +62,7 @@ def list_devices(plan: Plan) -> list[str]:
             f"camera   {camera.name:10s} {camera.model} ({camera.driver}{_image_source(camera)}), "
             f"{camera.width}x{camera.height} {streams} at {camera.rate_hz:g} Hz"
         )
-    lines.extend(f"gamepad  {pad.name:10s} {_pad(pad)}" for pad in plan.pads)
+    lines.extend(f"{pad.kind:8s} {pad.name:10s} {_pad(pad)}" for pad in plan.pads)
     if plan.world is not None:
         bodies = ", ".join(body.name for body in plan.world.bodies) or "empty"
         lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {bodies}")
@@ -78,9 +78,13 @@ def _missing_libraries(plan: Plan) -> dict[str, str]:
 
 
 def _pad(pad: PadSpec) -> str:
-    """Return the model of a gamepad if the rig names one, its driver, and the arm that it drives."""
+    """Return the model of a gamepad or leader if the rig names one, its driver, and the arm that it drives."""
     model = "" if pad.model is None else f"{pad.model['title']}, "
-    return f"{model}{pad.driver}{'' if pad.drives is None else f', drives {pad.drives}'}"
+    drives = "" if pad.drives is None else f", drives {pad.drives}"
+    if (leader := pad.leader) is None:
+        return f"{model}{pad.driver}{drives}"
+    held = leader.deadman or ("its lever" if leader.may_drive_real else "none")
+    return f"{leader.title}, {pad.driver} at {pad.options.get('port', 'no port')}, dead-man: {held}{drives}"
 
 
 def _image_source(camera: CameraSpec) -> str:

@@ -55,6 +55,7 @@ LISTS = {
     "cameras": ("sensors", "cameras"),
     "rigs": ("config",),
     "pads": ("sensors", "gamepads"),
+    "leaders": ("sensors", "leaders"),
 }
 """Kind of built-in file -> its folder."""
 

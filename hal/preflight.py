@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from . import registry
 from .errors import HalError
-from .specs import CameraSpec, GripperSpec, RobotSpec
+from .specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 if TYPE_CHECKING:
     from .driver import CameraDriver
@@ -61,7 +61,7 @@ def preflight(
         plan: The resolved rig.
         duration: Time for which each arm's network and each camera's rate is measured, s.
         machine: Whether to check this computer.
-        cameras: Whether to check the cameras.
+        cameras: Whether to check the cameras, and the leader arms.
     """
     if machine:
         yield from check_machine()
@@ -75,6 +75,8 @@ def preflight(
     for device in devices:
         for result in _check(device, duration):
             yield replace(result, name=f"{device.name}: {result.name}")
+    for leader in list_leaders(plan) if cameras else ():
+        yield _check_leader(leader, duration)
 
 
 def list_real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
@@ -85,6 +87,34 @@ def list_real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
 def list_checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
     """Return the cameras of a rig whose driver can check them before they are opened."""
     return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
+
+
+def list_leaders(plan: Plan) -> tuple[PadSpec, ...]:
+    """Return the leader arms of a rig that are real or emulated."""
+    leaders = (pad for pad in plan.pads if pad.leader is not None)
+    return tuple(spec for spec in leaders if not registry.load(spec.driver, "leader").simulated)
+
+
+def _check_leader(spec: PadSpec, duration: float) -> CheckResult:
+    """Read a leader for a while: what it is, whether it answers, and how often."""
+    name = f"{spec.name}: leader"
+    driver = registry.load(spec.driver, "leader")(spec)
+    driver.open()
+    try:
+        end, times = time.monotonic() + duration, set[float]()
+        while (now := time.monotonic()) < end:
+            reading = driver.poll(now, 0.01)
+            times.add(reading.t_alive)
+        found = driver.describe()
+    finally:
+        driver.close()
+    if not reading.connected:
+        cause, _, remedy = found.partition("; ")
+        return CheckResult(name, "fail", cause, remedy)
+    rate = (len(times) - 1) / duration
+    levels: tuple[Level, Level] = ("ok", "warn")
+    remedy = "connect its adapter directly; end busy programs"
+    return CheckResult(name, levels[rate < 80.0], f"{found}, {rate:.0f} readings per second", remedy)
 
 
 def _check_engine(engine: str) -> CheckResult:

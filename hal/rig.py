@@ -25,6 +25,7 @@ from .gamepad import Gamepad
 from .gripper import Gripper
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups
 from .host.process import SharedMemory
+from .leader import explain_unguarded, make_leader
 from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad
 from .robot import Robot
@@ -112,6 +113,7 @@ class Rig:
         self.robots: Devices[Robot] = Devices("robot")
         self.cameras: Devices[Camera] = Devices("camera")
         self.gamepads: Devices[Gamepad] = Devices("gamepad")
+        """Leader arms, then gamepads."""
         self.world: World = NoWorld()  # type: ignore[assignment]  # every use of it raises NotSupported
         self.clock: Clock = RealClock()
         self.notes: list[str] = list(plan.warnings)
@@ -262,13 +264,14 @@ class Rig:
         )
 
     def _open_pads(self, pads: Sequence[Chosen]) -> None:
-        for chosen in pads:
+        opened: dict[str, Gamepad] = {}
+        for chosen in sorted(pads, key=lambda chosen: chosen.spec.leader is not None):  # their dead-men first
             self.notes.extend(chosen.notes)
             spec = chosen.spec
-            driver = registry.load(spec.driver, "gamepad")(spec, self._pad_source(chosen))
-            gamepad = Gamepad(driver)
+            driver = registry.load(spec.driver, spec.kind)(spec, self._pad_source(chosen))
+            gamepad = Gamepad(driver) if spec.leader is None else make_leader(driver, opened)
             self._devices[spec.name] = driver
-            self.gamepads[spec.name] = gamepad
+            opened[spec.name] = gamepad
             gamepad.open(self.clock.now())
             self.notes.extend(gamepad.notes)
             if self.lock_step:
@@ -278,6 +281,7 @@ class Rig:
             if chosen.input == "console" and self.console is not None:
                 # A program that waits for a dead-man would seem to hang. Apps print a banner instead.
                 logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
+        self.gamepads.update((chosen.spec.name, opened[chosen.spec.name]) for chosen in pads)
 
     def _pad_source(self, chosen: Chosen) -> object | None:
         """Return the second argument of a gamepad driver: the console, this rig's stop, or the world's time."""
@@ -507,7 +511,8 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     Raises:
         DriverMissing: The engine of the simulated world, or the libraries of a page, are not installed.
         DeviceNotFound: No such pad.
-        NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
+        NotSupported: A viewer or a console that this rig cannot have, or a recording, or a leader without a dead-man,
+            for a real arm.
         ConfigError: A recording that cannot be played.
     """
     if plan.engine is not None:
@@ -515,6 +520,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     lock_step = plan.clock == "lock_step"
     known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
+    _check_leaders(plan, pads)
     pages = [chosen for chosen in pads if chosen.input == "console"]
     for chosen in pages[1:]:
         note = "the page is one pad, and drives one arm at a time; for the other one, plug in a gamepad"
@@ -522,7 +528,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     wrong = [
         Problem("--pad", "", message, code)
         for chosen in pads
-        for _, message, code in registry.check_record(chosen.spec.driver, "gamepad", chosen.spec)
+        for _, message, code in registry.check_record(chosen.spec.driver, chosen.spec.kind, chosen.spec)
     ]
     if wrong:
         raise ConfigError(wrong)
@@ -541,6 +547,14 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
             )
         registry.load(registry.provider("console"), "console")
     return pads
+
+
+def _check_leaders(plan: Plan, pads: Sequence[Chosen]) -> None:
+    """Refuse a leader without a dead-man where something real moves. Raises NotSupported."""
+    for chosen in pads:
+        leader = chosen.spec.leader
+        if leader is not None and not leader.may_drive_real and plan.attended and not plan.emulated:
+            raise NotSupported(explain_unguarded(chosen.spec.name), code="deadman_not_trusted")
 
 
 class Devices(dict[str, T]):

@@ -26,6 +26,7 @@ from .files import find_file, read_yaml, suggest
 from .models import load_pad_models
 from .objects import load_objects
 from .resolve_cameras import resolve_camera
+from .resolve_leaders import resolve_leader
 from .resolve_randomize import resolve_randomize
 from .resolve_robots import resolve_robot
 from .rigfile import Device, PadConfig
@@ -44,7 +45,7 @@ def resolve(context: Context) -> Plan:
     _check_names(context)
     robots = _resolve_all(context, "robots", resolve_robot)
     cameras = _resolve_all(context, "cameras", resolve_camera)
-    pads = _resolve_all(context, "gamepads", resolve_pad)
+    pads = _resolve_all(context, "leaders", resolve_leader) + _resolve_all(context, "gamepads", resolve_pad)
     with suppress(Unknown):
         _check_clock(context)
     _check_rates(context, robots)
@@ -237,7 +238,7 @@ def _resolve_all(
 
 def _check_names(context: Context) -> None:
     taken: dict[str, str] = {}
-    for section in ("robots", "cameras", "gamepads"):
+    for section in ("robots", "cameras", "leaders", "gamepads"):
         for name in getattr(context.rig, section, ()):
             key = f"{section}.{name}"
             if name in taken:

@@ -17,6 +17,7 @@ from hal.testing import (
     GamepadContract,
     GripperBench,
     GripperContract,
+    LeaderContract,
     RobotBench,
     RobotContract,
     WorldContract,
@@ -45,6 +46,7 @@ from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
 from .feetechs import so101_arm, so101_gripper
 from .frankas import FR3, franka_hand
+from .leaders import feetech_leader, mock_leader
 from .pads import mock_pad, playback_pad, terminal_steps, web_pad
 from .robotiqs import robotiq_gripper
 from .urs import Ur
@@ -360,6 +362,14 @@ class TestRecordedRealSenseOnDemand(CameraContract, left_out=FILE):
 
 
 # Gamepads.
+
+
+class TestMockLeader(LeaderContract):
+    bench = bench_of(mock_leader)
+
+
+class TestFeetechLeader(LeaderContract):
+    bench = bench_of(feetech_leader)
 
 
 class TestMockPad(GamepadContract):

@@ -13,12 +13,14 @@ from tempfile import gettempdir
 from typing import Any
 from unittest.mock import patch
 
+from hal.config import load
 from hal.drivers.feetech import bus
+from hal.drivers.feetech.leader import FeetechLeader
 from hal.specs import RobotSpec
 from hal_emulators.control import EmulatorControl
 from hal_emulators.feetech.server import FeetechEmulator, find_arms
 
-__all__ = ["FeetechProcess", "SteppedFeetech", "feetech_overrides"]
+__all__ = ["FeetechProcess", "SteppedFeetech", "feetech_overrides", "so101_leader"]
 
 _numbers = itertools.count(1)
 
@@ -59,6 +61,12 @@ class SteppedFeetech(FeetechEmulator):
     def __exit__(self, *_: object) -> None:
         super().__exit__()
         self._patience.stop()
+
+
+def so101_leader(emulator: SteppedFeetech) -> FeetechLeader:
+    """Return the driver of a leader whose motors are those of an emulated arm."""
+    rig = {"leaders": {"lead": {"model": "so101_leader", "port": emulator.arm.port}}}
+    return FeetechLeader(load(rig).resolve().pads[0])
 
 
 class FeetechProcess:

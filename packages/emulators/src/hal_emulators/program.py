@@ -23,7 +23,7 @@ DEVICES = {
     "franka": "a Franka arm and its hand",
     "ur": "a UR arm",
     "xarm": "a UFACTORY xArm",
-    "feetech": "every arm with Feetech servos of a rig",
+    "feetech": "every arm and leader with Feetech servos of a rig",
     "robotiq": "every Robotiq gripper of a rig",
 }
 

@@ -27,7 +27,7 @@ from hal_emulators.terminal import PseudoTerminal
 
 from .arm import EmulatedArm
 
-__all__ = ["FeetechEmulator", "find_arms", "help_text"]
+__all__ = ["FeetechEmulator", "find_arms", "find_leaders", "help_text"]
 
 _STEP = 0.002
 """Step of the mechanics, s."""
@@ -125,11 +125,16 @@ class ServoLine:
 
 
 def find_arms(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
-    """Return the arms of a rig that this emulator can play. Raises ConfigError and ValueError."""
-    found = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver == "feetech"]
-    if not found:
-        raise ValueError("this rig has no arm with Feetech servos that is not simulated")
-    return found
+    """Return the arms of a rig that this emulator can play. Raises ConfigError."""
+    return [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver == "feetech"]
+
+
+def find_leaders(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
+    """Return the leaders of a rig that this emulator can play, as SO-101s with their names. Raises ConfigError."""
+    pads = [pad for pad in load(config, overrides=overrides).resolve().pads if pad.leader is not None]
+    ports = {pad.name: pad.options["port"] for pad in pads if pad.driver == "feetech"}
+    arms = {name: {"model": "so101", "real": {"port": port}} for name, port in ports.items()}
+    return list(load({"sim": False, "robots": arms}).resolve().robots)
 
 
 class FeetechEmulator:
@@ -278,6 +283,10 @@ def _place(line: ServoLine, words: list[str]) -> None:
     line.arm.place([float(word) for word in words] or line.arm.plant.q.tolist())
 
 
+def _lead(line: ServoLine, words: list[str]) -> None:
+    line.arm.lead(float(words[0]), [float(word) for word in words[1:]])
+
+
 def _push(line: ServoLine, words: list[str]) -> None:
     line.arm.plant.push[int(words[0]) - 1] = float(words[1])
 
@@ -314,6 +323,9 @@ COMMANDS = {
     "temperature": _Command("temperature ID|all C", "change what a motor reports, deg C", _set_servos("temperature")),
     "register": _Command("register ID ADDRESS VALUE", "change a register, or two", _register),
     "place": _Command("place [Q ...]", "switch off, and hold the arm there until its torque is on", _place),
+    "hand": _Command(
+        "hand S Q ... [LEVER]", "a hand moves a leader there in S seconds, after its other motions", _lead
+    ),
     "push": _Command("push JOINT NM", "push a joint with this torque, until 0", _push),
     "object": _Command("object M|none", "put an object of this width into the jaw", _put),
     "state": _Command("state", "motion, goals, torque, errors", lambda line, _: line.arm.report()),
