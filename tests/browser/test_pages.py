@@ -83,8 +83,15 @@ def test_the_cameras_show_what_happens() -> None:
         bench.close()
 
 
-SIZES = [(1280, 800, False), (1920, 1080, False), (844, 390, True), (667, 375, True), (1024, 768, True)]
-NEEDED = ["#stop", "#hold", '[data-disc="dpad"]', '[data-disc="right"]', "#deadman"]
+SIZES = [
+    (1280, 800, False),
+    (1920, 1080, False),
+    (844, 390, True),
+    (667, 375, True),
+    (1024, 768, True),
+    (390, 844, True),
+]
+NEEDED = ["#stop", "#hold", '[data-disc="dpad"]', '[data-disc="right"]', "#deadman", "#speed", "#frame"]
 
 
 @pytest.mark.parametrize(("width", "height", "touch"), SIZES)
@@ -114,6 +121,10 @@ def test_the_main_controls_are_in_view_and_apart(page: Browser, width: int, heig
         places["#stop"],
     )
     assert top, "something covers the stop button"
+    page.tap("Escape", "Escape")
+    wait_for(lambda: page.text("#trip"), "the alarm")
+    alarm, picture = page.place("#trip"), page.place("#cameras")
+    assert alarm["bottom"] <= picture["top"] or alarm["top"] >= picture["bottom"], "the alarm covers the picture"
 
 
 TEXTS = """const found = [];
@@ -124,7 +135,7 @@ TEXTS = """const found = [];
     }"""
 
 
-@pytest.mark.parametrize(("width", "height", "touch"), [*SIZES, (390, 844, True), (960, 600, False)])
+@pytest.mark.parametrize(("width", "height", "touch"), [*SIZES, (960, 600, False)])
 def test_no_text_is_smaller_than_twelve_pixels(page: Browser, width: int, height: int, touch: bool) -> None:
     page.size(width, height, touch)
     script = "return found.filter(([at]) => parseFloat(getComputedStyle(at).fontSize) < 12).map(([, text]) => text)"
