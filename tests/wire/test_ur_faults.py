@@ -14,7 +14,7 @@ from hal_emulators.control import EmulatorControl
 
 from .ur_kit import UrEmulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 NAMED_WITHIN = 0.150
 FAULTS = {

@@ -15,7 +15,7 @@ import hal
 from .test_ur_faults import find_code, recover, wait_code
 from .xarm_kit import XArmEmulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 NAMED_WITHIN = 0.150
 FAULTS = {

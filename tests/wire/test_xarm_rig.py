@@ -23,7 +23,7 @@ from .test_ur_faults import recover, wait_code
 from .test_ur_rig import find_children
 from .xarm_kit import XArmEmulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 APP = """
 import sys, hal, json
