@@ -337,13 +337,13 @@ class _Surroundings:
         self._q: Array = np.zeros(model.n)
         self._ways: Array = np.zeros(model.n)
         n = self.own.stop - self.own.start
-        self._scales: Array = np.ones((1, n))
+        self._squared_scales: Array = np.ones((1, n))
         self.last: Floats = ()
         """Joint positions (n,), rad, of the newest call of :meth:`is_clear` that returned true, and the share of the
         room that was left there."""
         self.left = 0.0
         self.shares: list[float] = []
-        """The share of all room that the length of each vector of :meth:`measure_ways` takes at most."""
+        """The share of any pair's room that the length of each vector of :meth:`measure_ways` takes at most."""
         self._weights, self._turned, self._per_turn = [inf] * n, inf, inf
         """The share of any pair's room that each rad of each joint takes at most (n,); that the turns from the computed
         positions to some later ones have taken; and that each rad of the joints together takes."""
@@ -355,7 +355,7 @@ class _Surroundings:
 
     def measure_ways(self, *scales: Floats) -> None:
         """Measure the joints' ways by vectors: joint j goes at most ``scale[j] * vector[j]``, in rad, for each."""
-        self._scales = np.array(scales)
+        self._squared_scales = np.square(scales)
         self.shares = [inf] * len(scales)
         self._weights, self._turned, self._per_turn = [inf] * len(self._at), inf, inf
         self.left = -inf
@@ -389,10 +389,11 @@ class _Surroundings:
             there, end = neighbour()
             self._q[part], self._ways[part] = there, np.abs(np.subtract(end, there))
         near = self.bounds.near(self._q, self._ways, self.least)
-        weights = self.bounds.weights
-        own = weights[self.own]
-        self._weights, self._turned, self._per_turn = own.tolist(), 0.0, sqrt(own.dot(own))
-        self.shares = np.sqrt(np.square(self._scales * own).sum(axis=1)).tolist()
+        weights, own = self.bounds.weights, self.own
+        self._weights, self._turned = weights[own].tolist(), 0.0
+        squares = np.square(self.bounds.shares[own])
+        self._per_turn = sqrt(squares.sum(axis=0).max(initial=0.0))
+        self.shares = np.sqrt(self._squared_scales.dot(squares).max(axis=1, initial=0.0)).tolist()
         self._at = self._later = tuple(q)
         self.last = ()
         self._others_at = [
