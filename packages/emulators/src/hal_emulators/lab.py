@@ -66,7 +66,9 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
 def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) -> Emulator | None:
     if driver in ("damiao", "piper"):
         return Emulator("can", ["can", *words])
-    if driver in ("robotiq", "feetech"):
+    if driver in ("feetech", "dynamixel"):
+        return Emulator("servo_bus", ["servo_bus", *words])
+    if driver == "robotiq":
         return Emulator(driver, [driver, *words])
     if arm.driver != driver or driver not in ("franka", "ur", "xarm"):
         return None

@@ -1,4 +1,4 @@
-"""The emulator as a program: ``hal emulate feetech --config so101``."""
+"""The emulator as a program: ``hal emulate servo_bus --config so101``."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from hal.errors import HalError
 from hal_emulators.control import CommandPort, add_rig_options, note_signals, serve_prompt
 from hal_emulators.shared_world import enter_world, has_world
 
-from .server import FeetechEmulator, find_arms, help_text
+from .server import ServoBusEmulator, find_arms, help_text
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
     parser = argparse.ArgumentParser(
-        prog="hal emulate feetech",
-        description="Emulates every arm with Feetech servos of a rig, on a pseudo terminal with the name of its port, "
-        "with mass, gravity and friction. What the manuals leave open is assumed; it proves nothing about a real arm.",
+        prog="hal emulate servo_bus",
+        description="Emulates every arm with Feetech or Dynamixel servos of a rig, on a pseudo terminal with the name "
+        "of its port, with mass, gravity and friction. What the manuals leave open is assumed; it proves nothing about "
+        "a real arm.",
         epilog="commands, typed here or sent to the control port; with several arms, the arm's name first:\n"
         + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ends = note_signals()
     try:
         with contextlib.ExitStack() as stack:
-            emulator = FeetechEmulator(find_arms(options.config, options.set), options.seed, realtime=True)
+            emulator = ServoBusEmulator(find_arms(options.config, options.set), options.seed, realtime=True)
             if not options.no_world and has_world(options.config, options.set):
                 for arm in emulator.arms.values():
                     arm.world = enter_world(stack, options.config, options.set, arm.spec)
