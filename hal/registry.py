@@ -34,8 +34,9 @@ GROUP = "hal.drivers"
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
         "damiao": "hal.drivers.can:DAMIAO",
+        "dynamixel": "hal.drivers.servo_bus:DYNAMIXEL",
         "evdev": "hal.drivers.evdev:DRIVER",
-        "feetech": "hal.drivers.feetech:DRIVER",
+        "feetech": "hal.drivers.servo_bus:FEETECH",
         "franka": "hal.drivers.franka:DRIVER",
         "mock": "hal.drivers.mock:DRIVER",
         "mujoco": "hal.drivers.mujoco:DRIVER",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
-from feetech_kit import SteppedFeetech, so101_leader
+from servo_bus_kit import SteppedServos, so101_leader
 
 from hal.config import load
 from hal.drivers.mock.leader import MockLeader
@@ -27,7 +27,7 @@ def mock_leader() -> Iterator[PadBench]:
 @contextmanager
 def feetech_leader() -> Iterator[PadBench]:
     """An emulated SO-101, whose motors have no torque."""
-    with SteppedFeetech() as far, closing(so101_leader(far)) as driver:
+    with SteppedServos() as far, closing(so101_leader(far)) as driver:
         yield PadBench(
             driver=driver,
             advance=lambda: far.advance(0.01),

@@ -43,11 +43,11 @@ from .benches import (
 from .can_arms import piper_arm, piper_gripper
 from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
-from .feetechs import so101_arm, so101_gripper
 from .frankas import FR3, franka_hand
 from .leaders import feetech_leader, mock_leader
 from .pads import mock_pad, playback_pad, terminal_steps, web_pad
 from .robotiqs import robotiq_gripper
+from .servo_buses import servo_bus_arm, servo_bus_gripper
 from .urs import Ur
 from .webcams import network_camera, video_file, webcam
 from .xarms import XArm7
@@ -103,7 +103,13 @@ ASKED = {"freeze": "a motor answers each question: one that does not for 0.1 s i
 class TestEmulatedSo101(RobotContract, left_out=ASKED | {"torque": "its motors take positions"}):
     """On a pseudo terminal, and in step with the bench's clock."""
 
-    bench = bench_of(so101_arm)
+    bench = bench_of(partial(servo_bus_arm, "so101"))
+
+
+class TestEmulatedViperX(TestEmulatedSo101):
+    """Two motors at shoulder and elbow, and a watchdog."""
+
+    bench = bench_of(partial(servo_bus_arm, "viperx"))
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +210,11 @@ class TestEmulatedDamiaoGripper(GripperContract, left_out={"freeze": "a silent m
 
 
 class TestEmulatedSo101Gripper(GripperContract, left_out=ASKED):
-    bench = bench_of(so101_gripper)
+    bench = bench_of(partial(servo_bus_gripper, "so101"))
+
+
+class TestEmulatedViperXGripper(GripperContract, left_out=ASKED):
+    bench = bench_of(partial(servo_bus_gripper, "viperx"))
 
 
 @pytest.mark.slow

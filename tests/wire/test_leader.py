@@ -14,7 +14,7 @@ from app_kit import CROSS, PS, run_here, write_pad
 
 from hal.apps import collect, replay
 from hal.recording import Dataset
-from hal_emulators.feetech.server import FeetechEmulator, find_leaders
+from hal_emulators.servo_bus.server import ServoBusEmulator, find_leaders
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
@@ -40,7 +40,7 @@ def test_two_leaders_drive_two_arms_and_the_recording_is_replayed(
     taps = [(float(t), CROSS) for t in (1, 2, 3)]  # on a busy computer the first ones come too early
     pad = write_pad(tmp_path, *taps, (5.8, PS), until=20.0, held=(3.4, 5.5))
     rig = ["--config", "./rig.yaml", "--sim"]
-    with FeetechEmulator(find_leaders("./rig.yaml")) as emulator:
+    with ServoBusEmulator(find_leaders("./rig.yaml")) as emulator:
         for turn in range(60):
             for leader in ("left", "right"):
                 emulator.execute(f"{leader} hand 1 {POSES[turn % 3]}")

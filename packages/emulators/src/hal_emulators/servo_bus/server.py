@@ -1,6 +1,6 @@
 """The emulator at work: one thread moves the arms of a rig in real time, and answers; commands inject faults.
 
-with FeetechEmulator(find_arms("so101")) as emulator:
+with ServoBusEmulator(find_arms("so101")) as emulator:
     emulator.execute("lose next 3 2")         # from any thread
 """
 
@@ -19,15 +19,16 @@ from time import monotonic
 from typing import Any, NamedTuple
 
 from hal.config.loader import load
-from hal.drivers.feetech.bus import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer, encode, split
+from hal.drivers.servo_bus.protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer
 from hal.specs import RobotSpec
 from hal_emulators.control import read_end, read_switch
 from hal_emulators.shared_world import PRIORITY, raise_priority
 from hal_emulators.terminal import PseudoTerminal
 
 from .arm import EmulatedArm
+from .servo import ALERT, SERVOS, DynamixelServo, Servo
 
-__all__ = ["FeetechEmulator", "find_arms", "find_leaders", "help_text"]
+__all__ = ["ServoBusEmulator", "find_arms", "find_leaders", "help_text"]
 
 _STEP = 0.002
 """Step of the mechanics, s."""
@@ -45,7 +46,6 @@ class ServoLine:
         self._came = b""
         self._late: list[tuple[float, bytes]] = []
         self.out_until = self.off_until = 0.0
-        self.baud = 1_000_000
         self.twins: set[int] = set()
         """Ids that two motors have."""
         self.reset()
@@ -65,34 +65,55 @@ class ServoLine:
             came = os.read(self.terminal.descriptors[0], 4096)
         except OSError:
             return
-        if monotonic() < self.off_until or self.terminal.baud != getattr(termios, f"B{self.baud}"):
+        self._hearing = [] if monotonic() < self.off_until else [s for s in self.arm.servos if self._can_hear(s)]
+        if not self._hearing:
             return
-        frames, self._came, _ = split(self._came + came)
+        frames, self._came, _ = self.arm.protocol.split(self._came + came)
         for frame in frames:  # of a question: in the place of an answer's errors it has the instruction
             self._take(frame)
+            for servo in self._hearing:
+                servo.quiet = 0.0
+
+    def _can_hear(self, servo: Servo) -> bool:
+        rate = getattr(termios, f"B{servo.baud}", None)
+        return servo.plugged and servo.boot <= monotonic() and rate == self.terminal.baud and not self._is_silent(servo)
 
     def _take(self, frame: Answer) -> None:
         id, instruction, data = frame
-        servos, arm = self.arm.servos, self.arm
+        width = len(self.arm.protocol.place(0))
+        words = [int.from_bytes(data[k : k + width], "little") for k in (0, width)]
+        there = [servo for servo in self._hearing if id in (servo.id, ALL)]
         if instruction == PING:
-            self._reply([arm.answer(one, 0, 0) for one in servos if id in (one, ALL)])
-        elif instruction == READ and id in servos:
-            self._reply([arm.answer(id, data[0], data[1])])
+            self._reply([(servo, 0, servo.ping()) for servo in there])
+        elif instruction == READ:
+            self._reply([(servo, 0, servo.read(*words)) for servo in there])
         elif instruction == SYNC_READ:
-            self._reply([arm.answer(one, data[0], data[1]) for one in data[2:] if one in servos])
-        elif instruction == WRITE and id in servos:
-            if not self._is_silent(id):
-                servos[id].write(data[0], data[1:])
-            self._reply([arm.answer(id, 0, 0)])
+            asked = [servo for one in data[2 * width :] for servo in self._hearing if servo.id == one]
+            self._reply([(servo, 0, servo.read(*words)) for servo in asked])
+        elif instruction == WRITE:
+            self._reply([(servo, servo.write(words[0], data[width:]), b"") for servo in there])
+            self._follow(id, words[0], data[width:])
         elif instruction == SYNC_WRITE:
-            size = data[1] + 1
-            for k in range(2, len(data), size):
-                if data[k] in servos and not self._is_silent(data[k]):
-                    servos[data[k]].write(data[0], data[k + 1 : k + size])
+            size = words[1] + 1
+            for k in range(2 * width, len(data), size):
+                for servo in self._hearing:
+                    if servo.id == data[k]:
+                        servo.write(words[0], data[k + 1 : k + size])
+                self._follow(data[k], words[0], data[k + 1 : k + size])
+        else:
+            for servo in there:
+                servo.take_other(instruction)
+            self._reply([(servo, 0, b"") for servo in there])
 
-    def _is_silent(self, id: int) -> bool:
+    def _follow(self, id: int, address: int, data: bytes) -> None:
+        """Let the motors with this secondary id take a frame, as far as it is none for what they store."""
+        for servo in self._hearing:
+            if isinstance(servo, DynamixelServo) and id == servo.registers[12] != servo.id and address >= servo.memory:
+                servo.write(address, data)
+
+    def _is_silent(self, servo: Servo) -> bool:
         now = monotonic()
-        return any(self.silent_until.get(key, 0.0) > now for key in (0, id))
+        return any(self.silent_until.get(key, 0.0) > now for key in (0, servo.id))
 
     def _is_lost(self, id: int) -> bool:
         for key in (id, 0):
@@ -101,15 +122,17 @@ class ServoLine:
                 return True
         return self._random.random() < self.lost_share
 
-    def _reply(self, answers: Sequence[Answer]) -> None:
-        for answer in answers:
-            if self._is_silent(answer.id) or self._is_lost(answer.id):
+    def _reply(self, answers: Sequence[tuple[Servo, int, bytes]]) -> None:
+        """Let motors answer with an error and registers."""
+        for servo, error, data in answers:
+            if self._is_lost(servo.id):
                 continue
-            frame = encode(*answer)
+            error |= (ALERT if servo.errors else 0) if isinstance(servo, DynamixelServo) else servo.errors
+            frame = self.arm.protocol.encode_answer(servo.id, error, data)
             if self.spoil_next:
                 self.spoil_next -= 1
                 frame = frame[:-1] + bytes((frame[-1] ^ 0x55,))
-            copies = self.copies + (answer.id in self.twins)
+            copies = self.copies + (servo.id in self.twins)
             self._late.append((monotonic() + self.delay, frame * copies))
         self.send_due(monotonic())
 
@@ -126,18 +149,28 @@ class ServoLine:
 
 def find_arms(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
     """Return the arms of a rig that this emulator can play. Raises ConfigError."""
-    return [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver == "feetech"]
+    return [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in SERVOS]
 
 
 def find_leaders(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
-    """Return the leaders of a rig that this emulator can play, as SO-101s with their names. Raises ConfigError."""
-    pads = [pad for pad in load(config, overrides=overrides).resolve().pads if pad.leader is not None]
-    ports = {pad.name: pad.options["port"] for pad in pads if pad.driver == "feetech"}
-    arms = {name: {"model": "so101", "real": {"port": port}} for name, port in ports.items()}
+    """Return the leaders of a rig that this emulator can play, as arms that they lead. Raises ConfigError."""
+    arms: dict[str, Any] = {}
+    for pad in load(config, overrides=overrides).resolve().pads:
+        if pad.leader is not None and pad.driver in SERVOS:
+            drivers, real = {"real": pad.driver}, {key: pad.options[key] for key in ("port", "ids")}
+            lever = {"id": pad.options["lever"], "zero": 2048, "widths": [[0, 0], [0.75, 0.1]]}
+            gripper = {"drivers": drivers, "real": lever}
+            own = pad.driver == "feetech"
+            arms[pad.name] = {
+                "model": pad.leader.leads[0],
+                "drivers": drivers,
+                "real": real if own else real | {"zero": 2048},
+            }
+            arms[pad.name] |= {} if own else {"gripper": gripper}
     return list(load({"sim": False, "robots": arms}).resolve().robots)
 
 
-class FeetechEmulator:
+class ServoBusEmulator:
     """All arms of a rig on servo buses, each on its line.
 
     Attributes:
@@ -164,7 +197,7 @@ class FeetechEmulator:
         self._paced, self._realtime = paced, realtime
         self.lock = threading.Lock()
         self.read_end = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="feetech-emulator", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="servo-bus-emulator", daemon=True)
 
     def advance(self, seconds: float) -> None:
         """Take what has come, and move the arms by ``seconds`` at once."""
@@ -215,7 +248,7 @@ class FeetechEmulator:
         except (ValueError, IndexError, KeyError) as error:
             raise ValueError(f"{error}; usage: {command.usage}") from None
 
-    def __enter__(self) -> FeetechEmulator:
+    def __enter__(self) -> ServoBusEmulator:
         for line in self.lines.values():
             line.terminal.open()
         self._thread.start()
@@ -258,25 +291,37 @@ def _twin(line: ServoLine, words: list[str]) -> None:
 
 def _power(line: ServoLine, words: list[str]) -> None:
     line.off_until = read_end(words[0] if words else "0.05")
-    for servo in line.arm.servos.values():
+    for servo in line.arm.servos:
         servo.restart()
 
 
 def _set_servos(name: str, factor: float = 1.0) -> Callable[[ServoLine, list[str]], None]:
     def run(line: ServoLine, words: list[str]) -> None:
-        for id, servo in line.arm.servos.items():
-            if words[0] in ("all", str(id)):
+        for servo in line.arm.servos:
+            if words[0] in ("all", str(servo.id)):
                 setattr(servo, name, round(factor * float(words[1])))
 
     return run
 
 
 def _register(line: ServoLine, words: list[str]) -> None:
-    address, value = int(words[1]), int(words[2])
-    servo = line.arm.servos[int(words[0])]
-    servo.registers[address] = value & 0xFF
-    if value > 0xFF or address in (3, 9, 11, 16, 31, 42, 48):
-        servo.put(address, value)
+    for servo in line.arm.find(int(words[0])):
+        servo.put(int(words[1]), int(words[2]))
+
+
+def _turn(line: ServoLine, words: list[str]) -> None:
+    for servo in line.arm.find(int(words[0])):
+        servo.lost_turns -= int(words[1])
+
+
+def _plug(line: ServoLine, words: list[str]) -> None:
+    for k, servo in enumerate(line.arm.servos, 1):
+        servo.plugged = words[0] == "all" or str(k) in words
+
+
+def _baud(line: ServoLine, words: list[str]) -> None:
+    for servo in line.arm.servos:
+        servo.put(servo.protocol.baud_address, servo.protocol.bauds[int(words[0])])
 
 
 def _place(line: ServoLine, words: list[str]) -> None:
@@ -302,7 +347,7 @@ def _reset(line: ServoLine, _: list[str]) -> None:
     line.out_until = line.off_until = 0.0
     line.arm.plant.push[:] = 0.0
     line.arm.peak[:] = [0.0] * len(line.arm.peak)
-    for servo in line.arm.servos.values():
+    for servo in line.arm.servos:
         servo.error, servo.voltage, servo.temperature = 0, 121, 31
 
 
@@ -315,13 +360,17 @@ COMMANDS = {
     "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", read_end)),
     "power": _Command("power [S|on|off]", "a brown-out: silent for 0.05 s or S, then without torque", _power),
     "twin": _Command("twin ID on|off", "two motors have this id", _twin),
-    "baud": _Command("baud N", "let the motors listen at this rate only", _set("baud", int)),
+    "baud": _Command("baud N", "let the motors listen at this rate only", _baud),
     "error": _Command(
-        "error ID|all BITS", "raise errors: 1 voltage, 2 sensor, 4 heat, 8 current, 32 overload", _set_servos("error")
+        "error ID|all BITS",
+        "raise errors: 1 voltage, 4 heat, 32 overload; Feetech: 2 sensor, 8 current; Dynamixel: 8 sensor, 16 shock",
+        _set_servos("error"),
     ),
     "voltage": _Command("voltage ID|all V", "change the supply", _set_servos("voltage", 10.0)),
     "temperature": _Command("temperature ID|all C", "change what a motor reports, deg C", _set_servos("temperature")),
-    "register": _Command("register ID ADDRESS VALUE", "change a register, or two", _register),
+    "register": _Command("register ID ADDRESS VALUE", "change a register, whatever its size", _register),
+    "turn": _Command("turn ID N", "let a Dynamixel motor count N turns more", _turn),
+    "plug": _Command("plug all|N ...", "only these motors are on the bus, counted from the base", _plug),
     "place": _Command("place [Q ...]", "switch off, and hold the arm there until its torque is on", _place),
     "hand": _Command(
         "hand S Q ... [LEVER]", "a hand moves a leader there in S seconds, after its other motions", _lead

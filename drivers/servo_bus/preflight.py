@@ -5,17 +5,19 @@ Nothing moves, and nothing is written.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from time import monotonic, sleep
 
+from hal import registry
 from hal.errors import ConfigError, ControlTaken, HalError
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 
-from .arm import FeetechArm
-from .bus import MotorState
-from .chain import COUNT, Chain
-from .gripper import FeetechGripper
+from .arm import ServoArm
+from .chain import Chain
+from .gripper import ServoGripper
+from .protocol import MotorState
 
 _HOT = 55
 """Temperature from which a check warns, deg C: the motors' own limit is 70 as delivered."""
@@ -37,11 +39,11 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
     Yields:
         One result per check.
     """
-    arm = FeetechArm(spec)
+    arm: ServoArm = registry.load(spec.driver, "robot")(spec)
     shared = spec.gripper is not None and spec.gripper.driver == spec.driver
-    devices: list[FeetechArm | FeetechGripper] = [arm]
+    devices: list[ServoArm | ServoGripper] = [arm]
     if shared and spec.gripper is not None:
-        devices.append(FeetechGripper(spec.gripper))
+        devices.append(registry.load(spec.driver, "gripper")(spec.gripper))
     try:
         for device in devices:
             device.open()
@@ -64,42 +66,44 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
 
 
 def _check_motors(chain: Chain, states: Sequence[MotorState]) -> Iterator[CheckResult]:
-    volts, hottest = [s.voltage / 10 for s in states], max(s.temperature for s in states)
-    nominal = 12.0 if chain.registers[0].voltage_max > 10.0 else 7.4
-    found = f"{chain.name}: {len(states)} STS3215 for {nominal:g} V, {min(volts):.1f} V, {hottest} deg C"
+    lowest, hottest = min(s.voltage for s in states), max(s.temperature for s in states)
+    kinds = Counter((r.model, r.nominal) for r in chain.registers)
+    kind = ", ".join(f"{count} {model} for {nominal:g} V" for (model, nominal), count in kinds.items())
+    found = f"{chain.name}: {kind}; {lowest:.1f} V, {hottest} deg C"
     fault = chain.fault(states)
+    weak = [r.nominal for r, s in zip(chain.registers, states, strict=True) if s.voltage < _WEAK * r.nominal]
     if fault is not None:
         yield CheckResult("motors", "fail", fault.cause, fault.remedy)
-    elif nominal == 12.0 and min(volts) < _WEAK * nominal:
-        yield CheckResult("motors", "warn", found, "a supply of 12 V: with less, the motors are weaker than the model")
+    elif weak and weak[0] > 10.0:
+        remedy = f"a supply of {weak[0]:g} V: with less, the motors are weaker than the model"
+        yield CheckResult("motors", "warn", found, remedy)
     elif hottest >= _HOT:
         yield CheckResult("motors", "warn", found, "let them cool down")
     else:
         yield CheckResult("motors", "ok", found)
-    slow = [label for label, r in zip(chain.labels.values(), chain.registers, strict=True) if r.return_delay]
+    slow = [label for label, r in zip(chain.labels, chain.registers, strict=True) if r.return_delay]
     if slow:
-        remedy = "connect once with LeRobot, which sets it to 0"
+        remedy = "set the return delay to 0: hal calibrate arm does"
         yield CheckResult("return delay", "warn", f"{', '.join(slow)} answers late by its return delay", remedy)
 
 
-def _check_ranges(arm: FeetechArm) -> Iterator[CheckResult]:
+def _check_ranges(arm: ServoArm) -> Iterator[CheckResult]:
     """Compare the ends of the calibrated ranges with the model's limits."""
     limits, far = arm.spec.limits, []
-    for k, (label, registers) in enumerate(zip(arm.chain.labels.values(), arm.chain.registers, strict=True)):
-        c = registers.calibration
-        half = 0.5 * (c.range_max - c.range_min) * COUNT
-        if min(limits.lower[k] + half, half - limits.upper[k]) < -_OFF:
-            far.append(f"{label} ends at {half:.2f} rad, {max(-limits.lower[k], limits.upper[k]):.2f} in the model")
-    fault = arm.find_outside()
+    for k, (label, (lower, upper)) in enumerate(zip(arm.chain.labels, arm.find_ranges(), strict=True)):
+        if lower > limits.lower[k] + _OFF or upper < limits.upper[k] - _OFF:
+            model = f"{limits.lower[k]:.2f} to {limits.upper[k]:.2f} rad"
+            far.append(f"{label} reaches {lower:.2f} to {upper:.2f} rad, {model} in the model")
+    fault = arm.chain.find_outside(arm.chain.read(monotonic()))
     if fault is not None:
         yield CheckResult("range", "fail", fault.cause, fault.remedy)
     elif far:
-        yield CheckResult("range", "warn", "; ".join(far), "calibrate it through its whole range: lerobot-calibrate")
+        yield CheckResult("range", "warn", "; ".join(far), "calibrate it through its whole range: hal calibrate arm")
     else:
         yield CheckResult("range", "ok", "every joint is inside its calibrated range, which has the model's limits")
 
 
-def _check_answers(arm: FeetechArm, duration: float) -> CheckResult:
+def _check_answers(arm: ServoArm, duration: float) -> CheckResult:
     """Read the arm at its rate, and count lost answers."""
     bus, dt = arm.chain.check(), 1.0 / arm.spec.rate_hz
     bus.reset_statistics()

@@ -1,26 +1,26 @@
-"""Benches of an SO-101 and of its gripper: the driver on a pseudo terminal, in step with the checks' time."""
+"""Benches of arms on servo buses and of their grippers: the driver on a pseudo terminal, in step with the checks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
-from feetech_kit import SteppedFeetech
+from servo_bus_kit import SteppedServos
 
-from hal.drivers.feetech.arm import FeetechArm
-from hal.drivers.feetech.gripper import FeetechGripper
+from hal import registry
 from hal.testing import GripperBench, RobotBench
 
-__all__ = ["so101_arm", "so101_gripper"]
+__all__ = ["servo_bus_arm", "servo_bus_gripper"]
 
 
 @contextmanager
-def so101_arm() -> Iterator[RobotBench]:
-    """An SO-101 at 100 Hz."""
-    with SteppedFeetech() as far, closing(FeetechArm(far.spec)) as driver:
+def servo_bus_arm(rig: str) -> Iterator[RobotBench]:
+    """The arm of a rig at 100 Hz."""
+    with SteppedServos(rig) as far, closing(registry.load(far.spec.driver, "robot")(far.spec)) as driver:
 
         def fail() -> str:
-            far.arm.joints[1].overloaded = True
+            servo = far.arm.joints[1][-1]
+            servo.overload()
             return "overloaded"
 
         yield RobotBench(
@@ -35,17 +35,17 @@ def so101_arm() -> Iterator[RobotBench]:
 
 
 @contextmanager
-def so101_gripper() -> Iterator[GripperBench]:
-    """The gripper of an SO-101, open, as if its width were proportional to the angle of the jaw.
+def servo_bus_gripper(rig: str) -> Iterator[GripperBench]:
+    """The gripper of an arm, open, an SO-101's as if its width were proportional to the angle of the jaw.
 
     A jaw that lags has other speeds than the contract's at the knees of the model's table.
     """
-    with SteppedFeetech(widths=()) as far:
+    with SteppedServos(rig, **({"widths": ()} if rig == "so101" else {})) as far:
         assert far.spec.gripper is not None
         assert far.arm.jaw is not None
         far.arm.jaw.q = far.arm.jaw.upper
         far.arm.place(far.spec.initial)
-        with closing(FeetechGripper(far.spec.gripper)) as driver:
+        with closing(registry.load(far.spec.driver, "gripper")(far.spec.gripper)) as driver:
             yield GripperBench(
                 driver=driver,
                 dt=0.02,  # so long that the steps of a count, 0.1 mm, matter little for a speed

@@ -1,16 +1,22 @@
-"""Driver of a gripper with one Feetech STS3215 on the bus of its arm."""
+"""Driver of a gripper with one servo on the bus of its arm."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from math import inf
+from typing import ClassVar
+
+import numpy as np
 
 from hal.driver import GripperDriver, GripperReading
 from hal.errors import Fault
 from hal.specs import GripperSpec
 
-from .bus import MotorState
-from .chain import Chain
-from .settings import FeetechGripperSettings
+from .chain import Chain, Joint
+from .dynamixel import Dynamixel
+from .feetech import Feetech
+from .protocol import COUNT, MotorState, ServoProtocol
+from .settings import ServoGripperSettings
 
 _AT_REST = 0.15
 """Time without motion after which the jaw is at rest, s."""
@@ -18,23 +24,25 @@ _STILL = 4e-4
 """Largest change of the width of a jaw at rest, m."""
 _TOLERANCE = 0.003
 """Largest distance from the target width at which the jaw counts as arrived, m."""
-_LEAST_TORQUE = 100
-"""Least torque limit, 1/1000, so that the jaw overcomes its own friction: chosen."""
+_LEAST_TORQUE = 0.1
+"""Least torque limit, share of the stall torque, so that the jaw overcomes its own friction: chosen."""
 
 
-class FeetechGripper(GripperDriver):
-    """A jaw on a servo bus (settings: :class:`~.settings.FeetechGripperSettings`).
+class ServoGripper(GripperDriver):
+    """A gripper on a servo bus (settings: :class:`~.settings.ServoGripperSettings`).
 
-    The ends of its motor's calibrated range are the model's: closed at the least count, open at the greatest. The goal
-    runs along at the speed of the command; the force of the command is the motor's torque limit. The motor holds its
-    last goal for ever, with that limit.
+    The goal runs along at the speed of the command; the force of the command is the motor's torque limit. The motor
+    holds its last goal for ever, with that limit.
     """
+
+    protocol: ClassVar[ServoProtocol]
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
-        self.settings = FeetechGripperSettings.of(spec)
-        self._way = abs(spec.opened[0] - spec.closed[0]) if spec.opened else 1.0
-        self.chain = Chain(spec.name, self.settings, (self.settings.id,), ("the jaw",), (self._way,))
+        self.settings = ServoGripperSettings.of(spec)
+        span = abs(spec.opened[0] - spec.closed[0]) if spec.opened and self.settings.widths is None else 0.0
+        joint = Joint("the jaw", (self.settings.id,), span)
+        self.chain = Chain(spec.name, self.protocol, self.settings, [joint], watch=False)
         self._forget()
 
     def _forget(self) -> None:
@@ -48,7 +56,7 @@ class FeetechGripper(GripperDriver):
         self._goal = self._speed = 0.0
         """Width at which the ramp ends, m, and its speed, m/s."""
         self._limit = 0
-        """Torque limit of the command, 1/1000."""
+        """Torque limit of the command."""
         self._fault: Fault | None = None
         """Why the newest command failed."""
         self._t_moved, self._still_at = -inf, 0.0
@@ -58,24 +66,28 @@ class FeetechGripper(GripperDriver):
         self.close()
         self._forget()
         self.chain.open()
+        table = self.settings.widths
+        if table is not None:
+            self._ways, self._widths = [self.settings.zero + angle / COUNT for angle, _ in table], [w for _, w in table]
+            return
+        low, high = self.chain.registers[0].calibration[2:]
+        self._ways = [low + share * (high - low) for share, _ in self.spec.travel]
+        self._widths = [width for _, width in self.spec.travel]
 
     def close(self) -> None:
         """Disconnect. The motor holds its last goal. Idempotent."""
         self.chain.close()
 
     def _count(self, width: float) -> int:
-        c = self.chain.registers[0].calibration
-        share = min(max(self.spec.travel_at(width), 0.0), 1.0)
-        return round(c.range_min + share * (c.range_max - c.range_min))
+        return round(float(np.interp(width, self._widths, self._ways)))
 
-    def _width(self, count: int) -> float:
-        c = self.chain.registers[0].calibration
-        return max(0.0, self.spec.width_at((count - c.range_min) / (c.range_max - c.range_min)))
+    def _width(self, count: float) -> float:
+        return float(np.interp(count, self._ways, self._widths))
 
     def _lever(self, width: float) -> float:
         """Return the change of the width for each rad of the motor, m/rad."""
-        share = self.spec.travel_at(width)
-        return (self.spec.width_at(share + 0.01) - self.spec.width_at(share - 0.01)) / (0.02 * self._way)
+        k = min(max(bisect_right(self._widths, width), 1), len(self._widths) - 1)
+        return (self._widths[k] - self._widths[k - 1]) / ((self._ways[k] - self._ways[k - 1]) * COUNT)
 
     def read(self, now: float) -> GripperReading:
         dt, self._now = max(0.0, min(now - self._now, _AT_REST)), now
@@ -97,7 +109,7 @@ class FeetechGripper(GripperDriver):
             else:
                 self._drive(state, width, dt)
         moving = self._is_driven() and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
-        torque = abs(state.load) / 1000 * self.chain.registers[0].stall_torque if state.on else 0.0
+        torque = abs(state.load) / self.protocol.full * self.chain.registers[0].stall_torque if state.on else 0.0
         blocked = width - self._goal > _TOLERANCE
         return GripperReading(
             t=state.t,
@@ -116,7 +128,7 @@ class FeetechGripper(GripperDriver):
 
     def _drive(self, state: MotorState, width: float, dt: float) -> None:
         """Switch the motor on where it is, then move its goal along at the speed of the command."""
-        if self._ramp is None or not state.on:
+        if self._ramp is None or not state.on or state.stopped:
             here = min(max(width, 0.0), self.spec.width_max)
             count = self._count(here)
             if state.goal == count and state.torque_limit == self._limit:
@@ -135,7 +147,7 @@ class FeetechGripper(GripperDriver):
 
     def _send(self, state: MotorState, width: float) -> None:
         if state.torque_limit != self._limit:
-            self.chain.write(48, {self.settings.id: self._limit.to_bytes(2, "little")})
+            self.chain.write_limit(self._limit)
         self.chain.write_goals([self._count(width)])
 
     def move(self, width: float, speed: float, force: float) -> None:
@@ -143,8 +155,8 @@ class FeetechGripper(GripperDriver):
         state, registers = self._state, self.chain.registers[0]
         self._target = self._goal = min(max(width, self.spec.width_min), self.spec.width_max)
         self._speed = min(speed, self.spec.speed)
-        torque = force * self._lever(self._target) / registers.stall_torque
-        self._limit = round(min(max(1000 * torque, _LEAST_TORQUE), registers.torque_max))
+        share = max(force * self._lever(self._target) / registers.stall_torque, _LEAST_TORQUE)
+        self._limit = round(min(self.protocol.full * share, registers.limit_max))
         if self._fault is not None or state is None or not state.on or state.error:
             self._ramp = None  # switching on again ends an overload
         elif self._ramp is None:
@@ -163,3 +175,15 @@ class FeetechGripper(GripperDriver):
             ramp = min(max(self._width(state.position), 0.0), self.spec.width_max)
             self._send(state, ramp)
         self._goal = self._ramp = ramp
+
+
+class FeetechGripper(ServoGripper):
+    """A gripper with a Feetech servo."""
+
+    protocol = Feetech()
+
+
+class DynamixelGripper(ServoGripper):
+    """A gripper with a Dynamixel servo."""
+
+    protocol = Dynamixel()
