@@ -20,6 +20,7 @@ FEETECH = DriverSpec(
     shared_options=("port", "baud", "calibration"),
     path_options=frozenset({"calibration"}),
     preflight="hal.drivers.servo_bus.preflight:check",
+    motors="hal.drivers.servo_bus.service:MotorService",
     payload=True,
 )
 
