@@ -44,7 +44,7 @@ GROUP = "hal.apps"
 """Group of the entry points of programs that other packages have."""
 BESIDE = {
     "emulate": (
-        "play what a rig names as real: Franka, UR, UFACTORY and CAN arms, Robotiq grippers",
+        "play what a rig names as real: Franka, UR, UFACTORY and CAN arms, servo buses, Robotiq grippers",
         "packages/emulators",
     ),
     "import-ark": ("convert a configuration of Ark", "packages/import-ark"),

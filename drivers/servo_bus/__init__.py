@@ -1,4 +1,4 @@
-"""Drivers of arms with servos on a serial bus: Feetech (SO-101) and Dynamixel (ViperX 300 S). See docs/so101.md."""
+"""Drivers of arms with servos on a serial bus: Feetech (SO-101) and Dynamixel (ViperX 300 S). See docs/servo-bus.md."""
 
 from __future__ import annotations
 
