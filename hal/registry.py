@@ -124,6 +124,8 @@ class DriverSpec:
     """The same for a real camera."""
     gripper_preflight: str | None = None
     """The same for a real gripper, where the driver of its arm does not check it."""
+    motors: str | None = None
+    """"module:class" of a real arm's record, which sets up and calibrates its motors (``hal setup-motors``)."""
     buses: str | None = None
     """"module:function" that yields a line for each adapter that this driver's devices can be connected to, without
     arguments; ``hal check --can`` prints them."""

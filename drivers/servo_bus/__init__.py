@@ -1,4 +1,4 @@
-"""Drivers of arms and leaders with servos on a bus: Feetech (SO-101) and Dynamixel (ViperX). See docs/so101.md."""
+"""Drivers of arms and leaders with servos on a bus: Feetech (SO-101), Dynamixel (ViperX). See docs/servo-bus.md."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ FEETECH = DriverSpec(
     shared_options=("port", "baud", "calibration"),
     path_options=frozenset({"calibration"}),
     preflight="hal.drivers.servo_bus.preflight:check",
+    motors="hal.drivers.servo_bus.service:MotorService",
     payload=True,
 )
 

@@ -90,6 +90,8 @@ class ServoArm(RobotDriver):
         self._first: list[int] = []
         """Goals that the motors have while they are engaged, and those before their torque is switched on."""
         self._sent: deque[tuple[list[int], Setpoint]] = deque(maxlen=_SENT)
+        self._written = False
+        """Whether a set-point was written since the last reading."""
         self._lead = [0.0] * len(self.spec.joints)
         """Present lead of the goals, rad."""
         self._crept = [0.0] * len(self.spec.joints)
@@ -127,6 +129,9 @@ class ServoArm(RobotDriver):
         dq = tuple(s * COUNT * state.velocity for s, state in zip(self._signs, states, strict=True))
         commanded = self._find_commanded(states) if self.engaged else None
         fault = self._judge(states, q, commanded)
+        if self.engaged and self._sent and not self._written:
+            self.write(self._sent[-1][1])  # between sessions it creeps on
+        self._written = False
         reading = Reading(t, t, self._seq, q, dq, fault=fault)
         if commanded is None or not self.engaged:
             return reading
@@ -201,6 +206,7 @@ class ServoArm(RobotDriver):
         goals = self._clip(self._counts([q + lead for q, lead in zip(setpoint.q, self._lead, strict=True)]))
         self.chain.write_goals(goals)
         self._sent.append((goals, setpoint))
+        self._written = True
         return True
 
     def _creep(self, k: int, off: float) -> None:

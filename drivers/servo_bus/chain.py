@@ -25,7 +25,7 @@ _SCAN = 20
 """Highest id that is tried where one is missing."""
 _IDENTIFY_PERIOD = 0.5
 """s between two checks of the motors of a port that came back."""
-_SPANS = 0.6, 1.3
+SPANS = 0.6, 1.3
 """Calibrated range of a joint as a share of the model's: outside of it the motor is not calibrated, or another one."""
 
 
@@ -161,7 +161,7 @@ class Chain:
             yield f"follows the motor {found.follows}, too: its secondary id; set it to 255", "wrong_mode"
         stored = found.calibration
         span = (stored.range_max - stored.range_min) * COUNT
-        least, most = (share * joint.span for share in _SPANS)
+        least, most = (share * joint.span for share in SPANS)
         if joint.span and not least <= span <= most:
             message = f"its range is {span:.2f} rad, {joint.span:.2f} in the model; calibrate it: hal calibrate arm"
             yield message, "not_calibrated"

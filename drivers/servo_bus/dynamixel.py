@@ -73,8 +73,10 @@ class Dynamixel(ServoProtocol):
     stored: ClassVar[Block] = (0, 86)
     state: ClassVar[Block] = (116, 31)
     status: ClassVar[Block] = (64, 38)
-    torque, limit, id_address, baud_address = 64, 100, 7, 8
+    torque, limit, id_address, baud_address, delay_address, lock = 64, 100, 7, 8, 9, None
     goal: ClassVar[Block] = (116, 4)
+    position: ClassVar[Block] = (132, 4)
+    free: ClassVar[tuple[int, int]] = (11, MULTI)  # in the mode of one turn it takes an offset of a quarter of it only
     restart = 1.5
     errors: ClassVar[Mapping[int, tuple[str, str, str]]] = {
         1: ("voltage", "has a supply of {0.voltage:.1f} V", "check the supply: 12 V, 5 V for an XL330"),
@@ -165,6 +167,12 @@ class Dynamixel(ServoProtocol):
     def clear(self, states: Mapping[int, MotorState]) -> list[tuple[int, int, bytes]]:
         """A motor with an error has switched its torque off; only a restart ends it."""
         return [(id, REBOOT, b"") for id, state in states.items() if state.error]
+
+    def decode_position(self, data: bytes) -> int:
+        return int.from_bytes(data, "little", signed=True)
+
+    def find_offset(self, count: int, wanted: int) -> int:
+        return wanted - count
 
     def store_calibration(self, calibration: Calibration) -> list[tuple[int, bytes]]:
         _, offset, low, high = calibration

@@ -41,8 +41,10 @@ class Feetech(ServoProtocol):
     stored: ClassVar[Block] = (0, 40)
     state: ClassVar[Block] = (40, 31)
     status = None
-    torque, limit, id_address, baud_address = 40, 48, 5, 6
+    torque, limit, id_address, baud_address, delay_address, lock = 40, 48, 5, 6, 7, 55
     goal: ClassVar[Block] = (42, 2)
+    position: ClassVar[Block] = (56, 2)
+    free: ClassVar[tuple[int, int]] = (33, 0)
     restart = 0.1
     errors: ClassVar[Mapping[int, tuple[str, str, str]]] = {
         1: (
@@ -135,11 +137,13 @@ class Feetech(ServoProtocol):
                 found += [(id, WRITE, bytes((40, state.on)))]
         return found
 
+    def decode_position(self, data: bytes) -> int:
+        return signed(int.from_bytes(data, "little"), 15)
+
+    def find_offset(self, count: int, wanted: int) -> int:
+        return count - wanted
+
     def store_calibration(self, calibration: Calibration) -> list[tuple[int, bytes]]:
         _, offset, low, high = calibration
-        return [
-            (55, b"\x00"),
-            (31, struct.pack("<H", unsigned(offset, 11))),
-            (9, struct.pack("<HH", low, high)),
-            (55, b"\x01"),
-        ]
+        words = (31, unsigned(offset, 11)), (9, low), (11, high)
+        return [(address, struct.pack("<H", word)) for address, word in words]

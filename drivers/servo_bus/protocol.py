@@ -111,8 +111,14 @@ class ServoProtocol(ABC):
     limit: ClassVar[int]
     """Address of the torque limit, two bytes."""
     goal: ClassVar[Block]
+    position: ClassVar[Block]
     id_address: ClassVar[int]
     baud_address: ClassVar[int]
+    delay_address: ClassVar[int]
+    lock: ClassVar[int | None]
+    """Address of the lock of what is stored; None if that is locked by the torque alone."""
+    free: ClassVar[tuple[int, int]]
+    """Address and value of the mode in which a motor is calibrated, and driven afterwards, as LeRobot has it."""
     restart: ClassVar[float]
     """Longest time until errors that were cleared are gone, s."""
     errors: ClassVar[Mapping[int, tuple[str, str, str]]]
@@ -156,6 +162,14 @@ class ServoProtocol(ABC):
     @abstractmethod
     def clear(self, states: Mapping[int, MotorState]) -> list[tuple[int, int, bytes]]:
         """Return the questions that end the errors of these motors: id, instruction, data."""
+
+    @abstractmethod
+    def decode_position(self, data: bytes) -> int:
+        """Return the count in :attr:`position`."""
+
+    @abstractmethod
+    def find_offset(self, count: int, wanted: int) -> int:
+        """Return the homing offset by which a motor without one counts ``wanted`` where it counts ``count`` now."""
 
     @abstractmethod
     def store_calibration(self, calibration: Calibration) -> list[tuple[int, bytes]]:
