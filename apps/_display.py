@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
-from urllib.parse import urlsplit
 
 from hal import registry
 
@@ -127,13 +126,6 @@ def list_links(rig: Rig) -> str:
         ]
         if rig.console.tunnel:
             lines += ["  On another computer, run this first:", "", f"      {rig.console.tunnel}", ""]
-    if rig.viewer3d is not None:
-        if not lines:
-            lines.append("")
-        lines += ["  3D view, on this computer:", "", f"      {rig.viewer3d.link}", ""]
-        if rig.console is not None and rig.console.tunnel:
-            port = urlsplit(rig.viewer3d.link).port
-            lines += [f"  (on another computer, add to the ssh command: -L {port}:127.0.0.1:{port})", ""]
     return "\n".join(lines)
 
 

@@ -123,7 +123,7 @@ class Rig:
         self.console: Console | None = None
         """The page in a browser; None if it is not served."""
         self.viewer3d: Viewer3D | None = None
-        """The page with the arms in 3D; None if it is not served."""
+        """The view of the arms in 3D on the console's page; None if there is none."""
         self._pictures: CameraRenderer | None = None
         self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
@@ -144,12 +144,12 @@ class Rig:
         pads = check_opening(plan, pad, viewer, console)
         groups = make_groups(plan)
         world_host = self._start_hosts(groups, realtime)
-        if console or any(chosen.input == "console" for chosen in pads):
+        if viewer == "3d":
+            self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
+        if console or viewer == "3d" or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)
         if world_host is not None:
             self._open_world_views(world_host, viewer)
-        if viewer == "3d":
-            self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
         self._wait_for_hosts(realtime)
         if world_host is not None:
             self.world = World(world_host.request, partial(self._pass_on_edit, world_host), self.plan.world)
@@ -159,7 +159,7 @@ class Rig:
                 gripper, collisions = self._make_gripper(spec), plan.collisions
                 robot = Robot(spec, host, self.clock, gripper, collisions, self.robots)
                 self.robots[spec.name] = robot
-        for opened in (self.console, self.viewer3d):
+        for opened in (self.viewer3d, self.console):
             if opened is not None:
                 opened.wait_ready()
                 self.notes.extend(opened.notes)
@@ -540,7 +540,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
         )
     if viewer == "3d":
         registry.load(registry.provider("viewer3d"), "viewer3d")
-    if console or any(chosen.input == "console" for chosen in pads):
+    if console or viewer == "3d" or any(chosen.input == "console" for chosen in pads):
         if lock_step:
             raise NotSupported(
                 "the console needs real time; in lock-step, time runs as fast as the program", code="needs_real_time"
