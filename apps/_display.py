@@ -52,7 +52,8 @@ def list_devices(plan: Plan) -> list[str]:
         hand = f", gripper {gripper.width_min:g}..{gripper.width_max:g} m" if gripper else ""
         if gripper and robot.attended and simulated:
             hand += f", {_real(robot, gripper)}"
-        lines.append(f"robot    {robot.name:10s} {robot.model}, {where}, {robot.rate_hz:g} Hz{hand}")
+        at = "" if robot.at is None else f" at {robot.at}"
+        lines.append(f"robot    {robot.name:10s} {robot.model}{at}, {where}, {robot.rate_hz:g} Hz{hand}")
         if robot.attended:
             lines.append(f"limits   {robot.name:10s} {_limits(robot)}")
     for camera in plan.cameras:
@@ -72,7 +73,8 @@ def list_devices(plan: Plan) -> list[str]:
 
 def _missing_libraries(plan: Plan) -> dict[str, str]:
     """Return the libraries of arms and grippers that are not installed -> the command that installs each."""
-    devices = [device for robot in plan.robots for device in (robot, robot.gripper) if device is not None]
+    here = [robot for robot in plan.robots if robot.at is None]
+    devices = [device for robot in here for device in (robot, robot.gripper) if device is not None]
     return {name: command for one in devices for name, command in registry.find_missing(one.driver, one).items()}
 
 

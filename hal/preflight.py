@@ -80,8 +80,8 @@ def preflight(
 
 
 def list_real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
-    """Return the arms of a rig that are real or emulated."""
-    return tuple(robot for robot in plan.robots if robot.attended or robot.emulated)
+    """Return the arms of a rig that are real or emulated, and at this computer: another one checks its own."""
+    return tuple(robot for robot in plan.robots if robot.at is None and (robot.attended or robot.emulated))
 
 
 def list_checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:

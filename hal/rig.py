@@ -23,7 +23,7 @@ from .commands import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
-from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups
+from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups, start_processes
 from .host.process import SharedMemory
 from .leader import explain_unguarded, make_leader
 from .observation import Observation, Observer
@@ -193,32 +193,22 @@ class Rig:
         self.notes.append(f"real-time priority (SCHED_FIFO) is refused: a busy computer delays the servos; {remedy}")
 
     def _start_hosts(self, groups: Sequence[GroupSpec], realtime: bool) -> Host | None:
-        """Start the processes of the groups; return the one with the simulated world.
-
-        That one is started last, because it mirrors the arms of the others.
-        """
-        world_host: Host | None = None
-        single = self.lock_step and len(groups) == 1  # needs no memory that another process can read
+        """Start the processes of the groups; return the one with the simulated world."""
+        if not self.lock_step:
+            for host in start_processes(groups, realtime, self._latch):
+                self._hosts.append(host)
+            return next((host for host in self._hosts if host.spec.world is not None), None)
+        single = len(groups) == 1  # needs no memory that another process can read
         memories = [] if single else [(group, RemoteHost.allocate(group)) for group in groups]
-        if self.lock_step:
-            stepped = [
-                SteppedHost(group, shared=shared, others=[] if group.robots else memories, latch=self._latch)
-                for group, shared in memories[1:]
-            ]
-            self._hosts.extend(stepped)
-            local = LocalHost(groups[0], stepped, self._latch, None if single else memories[0][1])
-            self._hosts.insert(0, local)
-            self.clock = LockStepClock(local.now, local.advance_to)
-            return local if local.spec.world is not None else None
-        for group, shared in sorted(memories, key=lambda pair: pair[0].world is not None):
-            seen = group.world is not None or bool(group.neighbours) or not group.robots
-            others_ = [pair for pair in memories if seen and pair[0] is not group]
-            urgent = realtime and bool(group.robots)
-            host = RemoteHost(group, realtime=urgent, shared=shared, others=others_, latch=self._latch)
-            self._hosts.append(host)
-            if group.world is not None:
-                world_host = host
-        return world_host
+        stepped = [
+            SteppedHost(group, shared=shared, others=[] if group.robots else memories, latch=self._latch)
+            for group, shared in memories[1:]
+        ]
+        self._hosts.extend(stepped)
+        local = LocalHost(groups[0], stepped, self._latch, None if single else memories[0][1])
+        self._hosts.insert(0, local)
+        self.clock = LockStepClock(local.now, local.advance_to)
+        return local if local.spec.world is not None else None
 
     def _make_gripper(self, robot: RobotSpec) -> Gripper | None:
         spec = robot.gripper

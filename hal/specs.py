@@ -181,6 +181,8 @@ class RobotSpec:
     """Options of the driver (``real:`` or ``simulated:`` of the rig's file)."""
     source: str = ""
     """The rig's file, or ``<dict>``."""
+    at: str | None = None
+    """Address of the computer that serves this arm; None if it is at this one."""
 
 
 @dataclass(frozen=True)
@@ -416,6 +418,11 @@ class GroupSpec:
     """What its arms must not touch; None if nothing is checked."""
     neighbours: tuple[RobotSpec, ...] = ()
     """Arms of other groups that its arms must not touch."""
+
+    @property
+    def at(self) -> str | None:
+        """Address of the computer that serves these devices; None if they are at this one."""
+        return self.robots[0].at if self.robots else None
 
 
 @dataclass(frozen=True)
