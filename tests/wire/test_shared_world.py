@@ -272,9 +272,7 @@ def is_put(rig, observation):
 """Plays what was collected; it succeeds when the cube is within 5 mm of where the person put it."""
 
 
-def test_what_a_person_collects_is_imitated(
-    fr3: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_person_collects_is_imitated(fr3: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     person = Person(hal.open)
     fr3 = Bench(fr3.rig, [*fr3.overrides, "robots.arm.move_speed=0.3", "gamepads={pad: {sim: true}}"])
     with monkeypatch.context() as patch, redirect_stdout(person.screen):
