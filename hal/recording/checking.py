@@ -124,50 +124,74 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
         return
     if info is None:
         return
-
-    def wrong(path: Path, what: str, number: int | None = None) -> DatasetError:
-        return DatasetError(what, file=str(path.relative_to(layout.root)), episode=number)
-
-    total, numbers = int(info["total_episodes"]), layout.numbers()
-    places: list[tuple[int, EpisodePlace]] = []
-    for number in range(total):
-        about: dict[str, Any] = {}
-        if number not in numbers:
-            yield wrong(layout.about(number), "is missing", number)
-        with contextlib.suppress(DatasetError):  # reported with its row of the index
-            about = read_about(layout, number)
-        places.append((number, EpisodePlace.of(number, about)))
-    for path in stray_files(layout, places, video_names(info["features"])):
-        yield wrong(path, "is not in the index")
-    tasks: list[str] = []
-    try:
-        with dataset_errors(layout.root, layout.tasks):
-            tasks = read_tasks(layout.tasks)
-        if len(tasks) != info.get("total_tasks"):
-            yield wrong(layout.tasks, f"has {len(tasks)} tasks, and meta/info.json lists {info.get('total_tasks')}")
-    except DatasetError as error:
-        yield error
+    yield from _check_files(layout, info)
+    tasks, found = _check_tasks(layout, info)
+    yield from found
     start: int | None = 0
     entries: dict[int, dict[int, Any]] = {}
-    for number in range(total):
+    for number in range(int(info["total_episodes"])):
         try:
             start = None if start is None else _check_entry(layout, number, start, tasks, entries)
         except DatasetError as error:
             start = None
             yield error
-    if start is not None and start != info["total_frames"]:
-        yield wrong(layout.info, f"lists {info['total_frames']} rows, and the episodes have {start}")
+    yield from _check_totals(layout, info, start)
+    yield from _check_stats(layout, start)
+
+
+def _wrong(layout: DatasetLayout, path: Path, what: str, number: int | None = None) -> DatasetError:
+    return DatasetError(what, file=str(path.relative_to(layout.root)), episode=number)
+
+
+def _check_files(layout: DatasetLayout, info: Mapping[str, Any]) -> Iterator[DatasetError]:
+    """Yield episodes without a description, and files that the index does not know."""
+    numbers = layout.numbers()
+    places: list[tuple[int, EpisodePlace]] = []
+    for number in range(int(info["total_episodes"])):
+        about: dict[str, Any] = {}
+        if number not in numbers:
+            yield _wrong(layout, layout.about(number), "is missing", number)
+        with contextlib.suppress(DatasetError):  # reported with its row of the index
+            about = read_about(layout, number)
+        places.append((number, EpisodePlace.of(number, about)))
+    for path in stray_files(layout, places, video_names(info["features"])):
+        yield _wrong(layout, path, "is not in the index")
+
+
+def _check_tasks(layout: DatasetLayout, info: Mapping[str, Any]) -> tuple[list[str], list[DatasetError]]:
+    """Return the tasks, and what is wrong with their file."""
+    try:
+        with dataset_errors(layout.root, layout.tasks):
+            tasks = read_tasks(layout.tasks)
+    except DatasetError as error:
+        return [], [error]
+    if len(tasks) == info.get("total_tasks"):
+        return tasks, []
+    what = f"has {len(tasks)} tasks, and meta/info.json lists {info.get('total_tasks')}"
+    return tasks, [_wrong(layout, layout.tasks, what)]
+
+
+def _check_totals(layout: DatasetLayout, info: Mapping[str, Any], rows: int | None) -> Iterator[DatasetError]:
+    """Yield a wrong number of rows; ``rows`` is that of the episodes, None if it is unknown."""
+    if rows is not None and rows != info["total_frames"]:
+        yield _wrong(layout, layout.info, f"lists {info['total_frames']} rows, and the episodes have {rows}")
     with contextlib.suppress(DatasetError):  # reported with the rows of its episodes
-        rows = sum(_count_rows(layout, path) for path in layout.finished() if path.is_relative_to(layout.root / "data"))
-        if rows > info["total_frames"]:  # too few are reported with their episode
-            yield wrong(layout.info, f"lists {info['total_frames']} rows, and the files in data/ have {rows}")
+        data = layout.root / "data"
+        found = sum(_count_rows(layout, path) for path in layout.finished() if path.is_relative_to(data))
+        if found > info["total_frames"]:  # too few are reported with their episode
+            what = f"lists {info['total_frames']} rows, and the files in data/ have {found}"
+            yield _wrong(layout, layout.info, what)
+
+
+def _check_stats(layout: DatasetLayout, rows: int | None) -> Iterator[DatasetError]:
+    """Yield where ``meta/stats.json`` is damaged, or wrong for so many rows; None if their number is unknown."""
     try:
         with dataset_errors(layout.root, layout.stats):
             stats = json.loads(layout.stats.read_text(encoding="utf-8"), parse_constant=_no_constant)
-            if start is not None and stats[STATE]["count"] != [start]:
-                yield wrong(layout.stats, f"counts {stats[STATE]['count']} rows, and there are {start}")
-            elif start is not None:
-                yield from (wrong(layout.stats, what) for what in _stats_differences(layout, stats))
+            if rows is not None and stats[STATE]["count"] != [rows]:
+                yield _wrong(layout, layout.stats, f"counts {stats[STATE]['count']} rows, and there are {rows}")
+            elif rows is not None:
+                yield from (_wrong(layout, layout.stats, what) for what in _stats_differences(layout, stats))
     except DatasetError as error:
         yield error
 
@@ -330,16 +354,19 @@ def _features(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
     if added := [key for key in new if key not in old]:
         yield f"only here: {', '.join(added)}"
     for key in (key for key in old if key in new):
-        there, here = old[key], new[key]
-        for what in ("dtype", "shape"):
-            if there.get(what) != here.get(what):
-                yield f"{what} of {key} is {there.get(what)} there, and {here.get(what)} here"
-        if there.get("names") != here.get("names"):
-            yield _names(key, there.get("names") or [], here.get("names") or [])
-        video, ours = there.get("info") or {}, here.get("info") or {}
-        for what in dict.fromkeys([*video, *ours]):
-            if what not in _SAID_ELSEWHERE and video.get(what) != ours.get(what):
-                yield f"{what} of {key} is {video.get(what)} there, and {ours.get(what)} here"
+        yield from _feature(key, old[key], new[key])
+
+
+def _feature(key: str, there: Mapping[str, Any], here: Mapping[str, Any]) -> Iterator[str]:
+    for what in ("dtype", "shape"):
+        if there.get(what) != here.get(what):
+            yield f"{what} of {key} is {there.get(what)} there, and {here.get(what)} here"
+    if there.get("names") != here.get("names"):
+        yield _names(key, there.get("names") or [], here.get("names") or [])
+    video, ours = there.get("info") or {}, here.get("info") or {}
+    for what in dict.fromkeys([*video, *ours]):
+        if what not in _SAID_ELSEWHERE and video.get(what) != ours.get(what):
+            yield f"{what} of {key} is {video.get(what)} there, and {ours.get(what)} here"
 
 
 def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:

@@ -309,8 +309,6 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         "intervention": interventions(columns),
         "next.success": last_row(rows, closed["success"] is True),
         "next.done": last_row(rows, True),
-    }
-    columns |= {
         "timestamp": np.arange(rows)[:, None] / fps,
         "frame_index": np.arange(rows)[:, None],
         "episode_index": np.full((rows, 1), number),
@@ -335,14 +333,18 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
 
     write_table(put("entry.parquet", layout.entry(place.entry)), entries)
     pq.write_table(tasks_table(tasks), put("tasks.parquet", layout.tasks))
-    before = read_json(layout.stats) if layout.stats.exists() else {}
-    whole = {key: merge_stats([*filter(None, [before.get(key)]), found]) for key, found in stats.items()}
-    write_json(put("stats.json", layout.stats), stats_as_lists(whole))
+    write_json(put("stats.json", layout.stats), stats_as_lists(_add_stats(layout, stats)))
     write_json(put("info.json", layout.info), info | totals(number + 1, start + rows, len(tasks)))
     for source, _ in made:
         sync_to_disk(source)
     sync_to_disk(final)
     return [(str(source.relative_to(rest.folder)), str(target.relative_to(layout.root))) for source, target in made]
+
+
+def _add_stats(layout: DatasetLayout, stats: Mapping[str, Stats]) -> dict[str, Stats]:
+    """Return the statistics of all episodes with those of one more."""
+    before = read_json(layout.stats) if layout.stats.exists() else {}
+    return {key: merge_stats([*filter(None, [before.get(key)]), found]) for key, found in stats.items()}
 
 
 def _continue_episode(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -412,22 +412,12 @@ def select_devices(
             "poses of objects can be recorded where a simulation has movable ones; this rig has none", code="no_objects"
         )
     names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
-    buffers, notes = [], []
+    buffers, notes = list[CameraBuffer](), list[str]()
     for name in names:
-        buffer = CameraBuffer(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
-        setup = buffer.setup
-        if setup.videos and (setup.width % 2 or setup.height % 2):
-            size = f"{setup.width}x{setup.height}"
-            raise CommandError(
-                f"the size of a video must be even: change cameras.{name}.output, which is {size}", code="odd_size"
-            )
-        if setup.videos or setup.depths:
+        buffer = _make_buffer(rig, name, streams)
+        if buffer.setup.videos or buffer.setup.depths:
             buffers.append(buffer)
-        own = rig.cameras[name].spec.streams
-        if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
-            notes.append(f"camera {name}: {', '.join(left)} not recorded")
-        if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
-            notes.append(f"camera {name} has no {', '.join(missing)}")
+        notes += _describe_streams(name, rig.cameras[name].spec.streams, streams)
     for files in ([buffer.setup.videos for buffer in buffers], [buffer.setup.depths for buffer in buffers]):
         file_names = [name for each in files for name in each]
         if double := [name for name in file_names if file_names.count(name) > 1]:
@@ -439,6 +429,26 @@ def select_devices(
         seq = sampler.place_of(f"{TIMES}camera.{buffer.camera.name}") + 2
         buffer.setup = buffer.setup._replace(seq=seq)
     return sampler, buffers, notes
+
+
+def _make_buffer(rig: Rig, name: str, streams: Collection[str]) -> CameraBuffer:
+    """Return the buffer of a camera. Raises CommandError if its pictures cannot be a video."""
+    buffer = CameraBuffer(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
+    setup = buffer.setup
+    if setup.videos and (setup.width % 2 or setup.height % 2):
+        size = f"{setup.width}x{setup.height}"
+        raise CommandError(
+            f"the size of a video must be even: change cameras.{name}.output, which is {size}", code="odd_size"
+        )
+    return buffer
+
+
+def _describe_streams(camera: str, own: Collection[str], streams: Collection[str]) -> Iterator[str]:
+    """Yield which optional streams a camera has that are not recorded, and which it lacks."""
+    if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
+        yield f"camera {camera}: {', '.join(left)} not recorded"
+    if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
+        yield f"camera {camera} has no {', '.join(missing)}"
 
 
 def _gripper_state(robot: Robot, t: float) -> GripperState:

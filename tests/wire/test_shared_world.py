@@ -1,4 +1,4 @@
-"""The hands of emulated arms meet the objects of the world that the rig's cameras show: pick, place, record, replay."""
+"""The hands of emulated arms meet the objects of the world that the rig's cameras show: grasp, collect, imitate."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from waiting import wait_until
 
 import hal
 from hal.apps.collect import main as collect
-from hal.apps.replay import main as replay
 from hal.apps.rollout import main as rollout
 from hal.recording import Dataset
 from hal.skills import SkillProgress, grasp, grasp_pose, locate_by_truth
@@ -273,9 +272,7 @@ def is_put(rig, observation):
 """Plays what was collected; it succeeds when the cube is within 5 mm of where the person put it."""
 
 
-def test_what_a_person_collects_is_replayed_and_imitated(
-    fr3: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_person_collects_is_imitated(fr3: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     person = Person(hal.open)
     fr3 = Bench(fr3.rig, [*fr3.overrides, "robots.arm.move_speed=0.3", "gamepads={pad: {sim: true}}"])
     with monkeypatch.context() as patch, redirect_stdout(person.screen):
@@ -292,11 +289,6 @@ def test_what_a_person_collects_is_replayed_and_imitated(
     assert moved[-1, 1] < moved[0, 1] - 0.05
     assert moved[-1, 2] == pytest.approx(moved[0, 2], abs=2e-3)
     assert lifted[-1, 2] > lifted[0, 2] + 0.05, "it is still held"
-
-    shown = run_here(replay, str(tmp_path / "data"), "--unattended", *fr3.words)
-    assert shown.returncode == 0, shown.stdout + shown.stderr
-    with fr3.open() as rig:
-        assert rig.world.pose("cube").position == pytest.approx(moved[-1], abs=5e-3)
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
