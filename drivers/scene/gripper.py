@@ -233,7 +233,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._disturbances.update()
         if self._disturbances.active:
             self._disturbances.measure(*self._sense())
-        if self.travel.varies and self._engaged and self._driven is not None:
+        if self._engaged and self._driven is not None and self.travel.varies:
             self.drive_fingers(*self._driven)
 
     def _expect_open(self) -> None:
