@@ -578,7 +578,7 @@ def child_main(target: str, fds: Sequence[int], about: Sequence[Any]) -> None:
             with contextlib.suppress(ImportError):  # its user reports what is missing
                 __import__(name)
         memories = [SharedMemory(fd=memory) for memory in channel.receive_descriptors()]
-        task = channel.receive(START_TIMEOUT)
+        task: Any = channel.receive(START_TIMEOUT)
         from .records import LAYOUT
 
         if task["layout"] != LAYOUT:
