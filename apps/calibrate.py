@@ -1,10 +1,11 @@
-"""Calibrate a camera with a printed board, its pose or its intrinsics; or find where a gripper is closed.
+"""Calibrate a camera with a printed board, its pose or its intrinsics; where a gripper is closed; or an arm.
 
 hal calibrate board --out board.pdf
 hal calibrate --sim --config panda_calibration --camera wrist --auto
 hal calibrate --real --config my_rig.yaml --camera wrist --auto
 hal calibrate intrinsics --real --config my_rig.yaml --camera scene
 hal calibrate gripper --real --config my_rig.yaml
+hal calibrate arm --real --config my_rig.yaml
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from hal.apps._common import (
 )
 from hal.apps._display import banner, list_devices, list_links
 from hal.apps._gripper_zero import find_zero, gripper_parser
+from hal.apps.setup_motors import arm_parser, calibrate_arm
 from hal.errors import CommandError
 
 if TYPE_CHECKING:
@@ -45,7 +47,8 @@ def parser() -> argparse.ArgumentParser:
         prog="hal calibrate",
         description="Calibrate a camera on the hand or beside the arm, with a printed board.",
         epilog="To print the board: hal calibrate board --out board.pdf. Focal length and distortion of a "
-        "webcam: hal calibrate intrinsics. Where a gripper is closed: hal calibrate gripper. Ctrl-C stops the arm.",
+        "webcam: hal calibrate intrinsics. Where a gripper is closed: hal calibrate gripper. Servos on a bus: hal "
+        "calibrate arm. Ctrl-C stops the arm.",
     )
     add_rig_options(made)
     task = made.add_argument_group("task")
@@ -125,6 +128,8 @@ def main(argv: list[str] | None = None) -> int:
         return run_app(_measure_lens, intrinsics_parser(), given[1:])
     if given[:1] == ["gripper"]:
         return run_app(find_zero, gripper_parser(), given[1:])
+    if given[:1] == ["arm"]:
+        return run_app(calibrate_arm, arm_parser(), given[1:])
     return run_app(_main, parser(), given)
 
 

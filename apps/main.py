@@ -32,18 +32,20 @@ PROGRAMS = {
     "dataset": "list, mark, delete, trim, merge, split and check recorded episodes",
     "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
+    "serve": "serve the arms of this computer to a program on another one",
     "serve-lerobot": "serve a policy that was trained with LeRobot, for rollout",
     "generate": "generate a dataset in simulation, on several workers",
     "grasp": "find an object and grasp it",
     "push": "find an object and push it to a goal",
     "export": "convert a dataset for training",
-    "calibrate": "measure where a camera is, its lens, where a gripper is closed; home a gripper",
+    "calibrate": "measure where a camera is, its lens, where a gripper is closed; home a gripper; calibrate servos",
+    "setup-motors": "give the motors of an arm on a servo bus their ids",
 }
 GROUP = "hal.apps"
 """Group of the entry points of programs that other packages have."""
 BESIDE = {
     "emulate": (
-        "play what a rig names as real: Franka, UR, UFACTORY and CAN arms, Robotiq grippers",
+        "play what a rig names as real: Franka, UR, UFACTORY and CAN arms, servo buses, Robotiq grippers",
         "packages/emulators",
     ),
     "import-ark": ("convert a configuration of Ark", "packages/import-ark"),
@@ -55,6 +57,7 @@ LISTS = {
     "cameras": ("sensors", "cameras"),
     "rigs": ("config",),
     "pads": ("sensors", "gamepads"),
+    "leaders": ("sensors", "leaders"),
 }
 """Kind of built-in file -> its folder."""
 

@@ -24,6 +24,9 @@ BROWSER, SYSTEM, WIRE = "tests/browser/test_", "tests/system/test_", "tests/wire
 CAN, ARMS = "tests/lock_step/test_can_faults.py::test_", "tests/unit/core/test_session_arms.py::test_"
 ELSEWHERE = {
     "the console's browser freezes": (f"{BROWSER}trips.py", f"{BROWSER}pages.py"),
+    "a [leader arm](leaders.md) is unplugged": (
+        "tests/unit/core/test_leader.py::test_a_leader_that_is_lost_while_the_pad_is_held_stops_the_arm_within_150_ms",
+    ),
     "another arm of the same `hal teleop`": (
         f"{ARMS}a_trip_of_one_arm_holds_the_other_until_a_new_press_of_its_own",
         f"{ARMS}independent_arms_do_not_stop_each_other",
@@ -55,8 +58,11 @@ ELSEWHERE = {
         f"{WIRE}piper_rig.py::test_an_arm_whose_program_ends_holds",
         f"{WIRE}piper_rig.py::test_a_bus_that_is_cut_stops_the_program_and_comes_back",
     ),
-    "the host of an SO-101 dies": (f"{WIRE}so101_rig.py::test_an_arm_whose_program_is_killed_holds",),
-    "a servo of an SO-101 reports a fault": (f"{WIRE}so101_rig.py::test_a_fault_of_bus_or_motor",),
+    "the host of an arm on a servo bus": (f"{WIRE}servo_bus_rig.py::test_an_arm_whose_program_is_killed_holds",),
+    "the host of a ViperX freezes": (
+        "tests/unit/drivers/servo_bus/test_servo_bus.py::test_a_motor_stops_when_it_hears_nothing_and_is_switched_on_anew",
+    ),
+    "a servo of a bus reports a fault": (f"{WIRE}servo_bus_rig.py::test_a_fault_of_bus_or_motor",),
     "a motor or joint on a CAN bus": (f"{CAN}a_fault_in_motion",),
     "the process of a Robotiq gripper dies": (
         f"{WIRE}robotiq.py::test_the_gripper_keeps_its_grip_when_its_process_is_killed",

@@ -5,7 +5,7 @@ hal emulate franka --robot fr3
 hal emulate ur --robot ur5e
 hal emulate xarm --robot xarm7
 hal emulate can --config yam_emulator
-hal emulate feetech --config so101
+hal emulate servo_bus --config so101
 hal emulate robotiq --config franka_robotiq
 """
 
@@ -23,14 +23,14 @@ DEVICES = {
     "franka": "a Franka arm and its hand",
     "ur": "a UR arm",
     "xarm": "a UFACTORY xArm",
-    "feetech": "every arm with Feetech servos of a rig",
+    "servo_bus": "every arm and leader with Feetech or Dynamixel servos of a rig",
     "robotiq": "every Robotiq gripper of a rig",
 }
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    devices = "\n".join(f"  {name:8s} {what}" for name, what in DEVICES.items())
+    devices = "\n".join(f"  {name:9s} {what}" for name, what in DEVICES.items())
     made = argparse.ArgumentParser(
         prog="hal emulate",
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -1,0 +1,274 @@
+"""A bus of servos on a serial line, which all devices of a process on it share.
+
+The line is half duplex: whoever asks waits for the answers before anything else is sent. Set-points are not answered.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import termios
+import threading
+from collections.abc import Collection, Mapping
+from time import monotonic
+from typing import Any
+
+from hal.errors import ConnectionLost, Fault
+from hal.lock import DeviceLock
+from hal.serial_line import explain, open_line, read_line, set_baud
+
+from .protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer, Block, MotorState, ServoProtocol
+
+_ANSWER, _OPENING = 0.008, 0.02
+"""Longest time to wait for answers in a cycle of 100 Hz, and while a device is opened, s."""
+_PATIENCE = 2.0
+"""Longest time to wait for another program to release the port, s."""
+_RETRY = 0.25
+"""Time between two tries to open a lost port, s."""
+
+
+class ServoBus:
+    """An open port. Use :meth:`acquire`.
+
+    Attributes:
+        states: The newest state of each motor, by its id.
+        opened: How often the port was opened: after it was lost, its motors may be others.
+    """
+
+    _buses: dict[str, ServoBus] = {}  # noqa: RUF012  # shared on purpose
+    _guard = threading.Lock()
+
+    def __init__(self, port: str, protocol: ServoProtocol, baud: int) -> None:
+        self.port, self.protocol, self.baud = port, protocol, baud
+        self.ids: list[int] = []
+        self.states: dict[int, MotorState] = {}
+        self._status: dict[int, bytes] = {}
+        """The newest :attr:`ServoProtocol.status` of each motor."""
+        self._turn = 0
+        """Number of motors whose status was asked for in turn."""
+        self.opened = 0
+        self.fault: Fault | None = None
+        self._lock = DeviceLock(f"servo-bus-{os.path.realpath(port)}", f"the servo bus at {port}", _PATIENCE)
+        self._line: int | None = None
+        self._users = 0
+        self._seen: set[object] = set()
+        """Who has the newest states."""
+        self._wait = False
+        """Whether answers were missing: the next cycle lets late ones pass, so that none counts as a newer one."""
+        self._t_tried = 0.0
+        self.reset_statistics()
+
+    @classmethod
+    def acquire(cls, port: str, protocol: ServoProtocol, baud: int | None = None) -> ServoBus:
+        """Return the process's bus at a port, and open it if it is not open yet.
+
+        Args:
+            port: Its serial device.
+            protocol: Of its motors.
+            baud: Bit/s; None for the protocol's usual one.
+
+        Raises:
+            ConnectionLost: It cannot be opened; the message says what to do.
+            ControlTaken: Another program on this computer uses it.
+        """
+        with cls._guard:
+            bus = cls._buses.get(port) or cls(port, protocol, baud or protocol.baud)
+            if bus._line is None:
+                bus._open()
+            if bus._line is None and not bus._users:
+                bus._lock.release()
+            bus.check()
+            cls._buses[port] = bus
+            bus._users += 1
+            return bus
+
+    def release(self, ids: Collection[int]) -> None:
+        """Give up one use of the bus, and these motors; the last one closes it."""
+        with self._guard:
+            self.ids = [id for id in self.ids if id not in ids]
+            self._users -= 1
+            if not self._users:
+                del self._buses[self.port]
+                self._close()
+                self._lock.release()
+
+    def reset_statistics(self) -> None:
+        """Start to count from zero."""
+        self.cycles = self.lost = self.surplus = self.spoilt = 0
+
+    def _open(self) -> None:
+        self._t_tried = monotonic()
+        try:
+            self._line = open_line(self.port, self.baud)
+        except OSError as error:
+            self._lose(error)
+        else:
+            self.fault, self._wait = None, False
+            self.opened += 1
+            self.states.clear()
+            self._status.clear()
+
+    def _close(self) -> None:
+        line, self._line = self._line, None
+        if line is not None:
+            os.close(line)
+
+    def _lose(self, error: OSError) -> None:
+        self._close()
+        cause, _, remedy = explain(error).partition("; ")
+        self.fault = Fault("port", f"{self.port}: {cause}", remedy)
+
+    def check(self) -> int:
+        """Return the open line. Raises ConnectionLost if the port does not work."""
+        if self._line is None:
+            raise ConnectionLost.of("servo bus", self.fault or Fault("closed", "it is not open", "open the rig"))
+        return self._line
+
+    def send(self, id: int, instruction: int, data: bytes) -> None:
+        """Send a frame. Raises ConnectionLost."""
+        frame, line = self.protocol.encode(id, instruction, data), self.check()
+        try:
+            if os.write(line, frame) < len(frame):
+                raise BlockingIOError(11, "it takes no more data")
+        except OSError as error:
+            self._lose(error)
+            self.check()
+
+    def write(self, address: int, values: Mapping[int, bytes]) -> None:
+        """Write registers of several motors at the same time: bytes of the same length, by id. No one answers."""
+        size = len(next(iter(values.values())))
+        data = b"".join(bytes((id,)) + value for id, value in values.items())
+        self.send(ALL, SYNC_WRITE, self.protocol.place(address, size) + data)
+
+    def ask(
+        self,
+        id: int,
+        instruction: int,
+        data: bytes,
+        wanted: Collection[int],
+        limit: float = _OPENING,
+        linger: float = 0.0,
+    ) -> dict[int, Answer]:
+        """Send a frame, and return the answers of the motors that are wanted, as far as they come in time.
+
+        Args:
+            id: Of the motor, or :data:`ALL`.
+            instruction: For example :data:`READ`.
+            data: Of the frame.
+            wanted: Ids of the motors that answer.
+            limit: Longest time to wait, s.
+            linger: Time to wait for further answers once all have come, s.
+
+        Raises:
+            ConnectionLost: The port does not work.
+        """
+        self._drain()
+        self.send(id, instruction, data)
+        found: dict[int, Answer] = {}
+        came, end = b"", monotonic() + limit
+        while (left := end - monotonic()) > 0.0:
+            line = self.check()
+            if not select.select([line], [], [], left)[0]:
+                break
+            try:
+                answers, came, spoilt = self.protocol.split(came + read_line(line))
+            except OSError as error:
+                self._lose(error)
+                continue
+            self.spoilt += spoilt
+            for answer in answers:
+                if answer.id in wanted and answer.id not in found:
+                    found[answer.id] = answer
+                else:
+                    self.surplus += 1
+            if len(found) == len(wanted):
+                if not linger:
+                    break
+                end, linger = monotonic() + linger, 1e-9
+        return found
+
+    def _drain(self) -> None:
+        """Drop what has come too late, or twice."""
+        try:
+            answers, _, _ = self.protocol.split(read_line(self.check()))
+        except OSError as error:
+            self._lose(error)
+            self.check()
+        else:
+            self.surplus += len(answers)
+
+    def read(self, id: int, address: int, size: int) -> bytes | None:
+        """Return registers of a motor; None if it does not answer. Raises ConnectionLost."""
+        for _ in range(3):
+            answer = self.ask(id, READ, self.protocol.place(address, size), (id,)).get(id)
+            if answer is not None and len(answer.data) == size:
+                return answer.data
+        return None
+
+    def store(self, id: int, address: int, data: bytes) -> bool:
+        """Write registers of a motor, and return whether it confirms that. Raises ConnectionLost."""
+        return bool(self.ask(id, WRITE, self.protocol.place(address) + data, (id,)))
+
+    def exchange(self, user: object, now: float) -> None:
+        """Bring :attr:`states` up to date: all motors are asked at once, once in each cycle of the users.
+
+        Raises:
+            ConnectionLost: The port does not work. It is opened again from time to time.
+        """
+        if self._line is None and monotonic() - self._t_tried > _RETRY:
+            self._open()
+        self.check()
+        if self._seen and user not in self._seen:
+            self._seen.add(user)
+            return
+        self._seen = {user}
+        if self._wait:
+            self._wait = False
+            self._drain()
+            return
+        end = monotonic() + _ANSWER
+        answers = self.read_all(self.protocol.state, self.ids, end)
+        self.cycles += 1
+        if self.protocol.status is not None and not self._wait:
+            new = self.read_all(self.protocol.status, self._choose(answers), end)
+            self._status.update((id, answer.data) for id, answer in new.items())
+        for id, answer in answers.items():
+            if self.protocol.status is None or id in self._status:
+                self.states[id] = self.protocol.decode_state(now, answer, self._status.get(id, b""))
+
+    def _choose(self, answers: Mapping[int, Answer]) -> list[int]:
+        """Return the motors whose status is read now: those that are new or report an error, and two in turn."""
+        urgent = [id for id in self.ids if id not in self._status or (id in answers and answers[id].error)]
+        self._turn += 2
+        return sorted({*urgent, *(self.ids[k % len(self.ids)] for k in (self._turn, self._turn + 1))})
+
+    def read_all(self, block: Block, ids: Collection[int], end: float) -> dict[int, Answer]:
+        """Return the answers of motors with these registers, as far as they come until ``end``, s, asked at once.
+
+        Raises:
+            ConnectionLost: The port does not work.
+        """
+        address, size = block
+        asked = self.protocol.place(address, size) + bytes(ids)
+        found = self.ask(ALL, SYNC_READ, asked, ids, end - monotonic())
+        self._wait = len(found) < len(ids)
+        self.lost += len(ids) - len(found)
+        return {id: answer for id, answer in found.items() if len(answer.data) == size}
+
+    def find_baud(self, id: int) -> int | None:
+        """Return the rate at which a motor answers, if it is not the bus's; None if it does at none."""
+        line = self.check()
+        try:
+            for baud in self.protocol.bauds:
+                set_baud(line, baud)
+                if baud != self.baud and self.ask(id, PING, b"", (id,)):
+                    return baud
+        finally:
+            if self._line is not None:
+                set_baud(line, self.baud)
+                termios.tcflush(line, termios.TCIOFLUSH)
+        return None
+
+    def statistics(self) -> dict[str, Any]:
+        """Return what was counted."""
+        return {"cycles": self.cycles, "lost": self.lost, "surplus": self.surplus, "spoilt": self.spoilt}

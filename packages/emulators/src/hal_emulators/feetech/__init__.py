@@ -1,1 +1,0 @@
-"""Emulated arms with Feetech servos on a serial bus: pseudo terminals with the names of their ports."""
