@@ -16,6 +16,6 @@ DRIVER = DriverSpec(
     software_renderer="hal.drivers.pybullet.tiny:TinyRenderer",
     pictures_preflight="hal.drivers.scene.camera:check_pictures",
     viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
-    checks={"camera": "hal.drivers.scene.exposure:check"},
+    checks={"camera": "hal.drivers.scene.depth_noise:check"},
     requires={"pybullet": "pip install 'robot-hal[sim]' (Python 3.10, 3.11, or a C++ compiler)"},
 )

@@ -28,7 +28,7 @@ from hal.specs import CameraSpec, Plan, WorldSpec, from_json, to_json
 from hal.views import CameraRenderer
 
 from .drawn import DrawnWorld
-from .exposure import Exposure, check_view, noise_of
+from .exposure import Exposure, check_view
 from .mirror import LocalMirror, WorldMirror
 from .renderer import GLRenderer, Renderer
 from .shapes import RenderScene
@@ -57,10 +57,13 @@ class SimulatedCamera(CameraDriver):
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
         self._open = False
-        info = self.nominal_info(f"simulated {PurePath(spec.model).stem}")
-        sensor = spec.depth_sensor if noise_of(spec) is not None else None
-        # With noise, depth comes in whole units, as from a real camera.
-        self._info = replace(info, depth_scale=sensor.unit) if sensor is not None else info
+        self._info = self.nominal_info(f"simulated {PurePath(spec.model).stem}")
+        if spec.options:
+            from .depth_noise import noise_of
+
+            sensor = spec.depth_sensor if noise_of(spec) is not None else None
+            if sensor is not None:  # with noise, depth comes in whole units, as from a real camera
+                self._info = replace(self._info, depth_scale=sensor.unit)
 
     @property
     def info(self) -> CameraInfo:

@@ -29,7 +29,8 @@ from ..deadman import Deadman
 from ..errors import CommandError, DriverMissing, MotionStopped, NotSupported, RobotFault
 from ..geometry import Pose, apply_rotation
 from ..observation import Observation
-from ..rig import Rig, open_rig
+from ..opening import open_rig
+from ..rig import Rig
 from ..robot import Robot
 from .episode import reset_scene, stands_in_world
 

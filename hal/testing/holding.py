@@ -12,7 +12,8 @@ from ..commands import Twist
 from ..errors import NotSupported
 from ..geometry import Pose
 from ..gripper import Gripper
-from ..rig import Rig, open_rig
+from ..opening import open_rig
+from ..rig import Rig
 from ..robot import Robot
 from ..specs import BodySpec
 

@@ -11,7 +11,7 @@ from errors_kit import raises_problems
 
 from hal.config import load
 from hal.drivers.scene.camera import SimulatedCamera
-from hal.drivers.scene.exposure import DepthNoise, depth_noise
+from hal.drivers.scene.depth_noise import DepthNoise, depth_noise
 from hal.specs import CameraSpec
 
 FB = 384.0 * 0.05
