@@ -5,17 +5,26 @@ from __future__ import annotations
 import sys
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 
 class _Choice:
     """As draccus.ChoiceRegistry: configurations by name."""
 
     id: str | None = None
+    choices: ClassVar[dict[str, Any]] = {}
 
     @classmethod
     def register_subclass(cls, name: str) -> Any:
-        return lambda subclass: subclass
+        return lambda subclass: cls.choices.setdefault(name, subclass)
+
+    @classmethod
+    def get_choice_class(cls, name: str) -> Any:
+        return cls.choices[name]
+
+
+def _make_robot(config: Any) -> Any:
+    return vars(sys.modules[type(config).__module__])[type(config).__name__.removesuffix("Config")](config)
 
 
 class _Device:
@@ -26,7 +35,11 @@ class _Device:
 if find_spec("lerobot") is None:
     for module, names in {
         "lerobot": {},
-        "lerobot.robots": {"Robot": _Device, "RobotConfig": type("RobotConfig", (_Choice,), {})},
+        "lerobot.robots": {
+            "Robot": _Device,
+            "RobotConfig": type("RobotConfig", (_Choice,), {}),
+            "make_robot_from_config": _make_robot,
+        },
         "lerobot.teleoperators": {
             "Teleoperator": _Device,
             "TeleoperatorConfig": type("TeleoperatorConfig", (_Choice,), {}),
