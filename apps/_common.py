@@ -26,6 +26,7 @@ from hal.types import STREAMS
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
+    from hal.gamepad import Gamepad
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.specs import Plan
@@ -396,15 +397,26 @@ def needs_deadman(plan: Plan, args: argparse.Namespace) -> bool:
     return bool(args.deadman) or (any(robot.attended for robot in plan.robots) and not args.unattended)
 
 
-def find_deadman(rig: Rig) -> tuple[Deadman, TeleopMapping, str]:
+def find_pad(rig: Rig, robot: Robot | None = None) -> Gamepad | None:
+    """Return the first gamepad, or the leader that leads an arm in a takeover; None if there is neither."""
+    pads = rig.gamepads.values()
+    leaders = [pad for pad in pads if robot and pad.driver.spec.leader and pad.driver.spec.drives in (None, robot.name)]
+    return next(iter([*leaders, *pads]), None)
+
+
+def find_deadman(rig: Rig, robot: Robot | None = None) -> tuple[Deadman, TeleopMapping, str]:
     """Return the dead-man of the rig's pad, the pad's mapping, and the name of the dead-man's control.
+
+    Args:
+        rig: Open rig.
+        robot: Arm that is led in a takeover; None if no leader is needed.
 
     Raises:
         CommandError: The rig has no pad (code ``no_gamepad``), or its pad's controls cannot be held (``cannot_hold``).
     """
     from hal.config.mapping import load_mapping
 
-    pad = next(iter(rig.gamepads.values()), None)
+    pad = find_pad(rig, robot)
     if pad is None:
         message = f"{rig.plan.source} has no gamepad to hold as the dead-man; see --pad and --unattended"
         raise CommandError(message, code="no_gamepad")

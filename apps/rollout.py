@@ -27,6 +27,7 @@ from hal.apps._common import (
     add_rig_options,
     check_episode_options,
     find_deadman,
+    find_pad,
     load_named,
     needs_deadman,
     program,
@@ -138,7 +139,7 @@ def main(args: argparse.Namespace) -> int:
             raise CommandError(f"{rig.plan.source} has no robot", code="no_robot")
         robot = rig.robots[args.robot or next(iter(rig.robots))]
         print(f"{banner(rig)}\n  policy   {args.policy}\n{list_links(rig)}", flush=True)
-        held = find_deadman(rig) if holds else (None, None, "")
+        held = find_deadman(rig, robot if args.takeover else None) if holds else (None, None, "")
         recorder = _recorder(rig, args)
         try:
             with _policy(rig, robot, args, config) as policy:
@@ -283,7 +284,8 @@ class RolloutRun:
         """Button -> how it marks an episode."""
         self.takeover: Takeover | None = None
         if mapping is not None:
-            self.pad = next(iter(rig.gamepads.values()))
+            self.pad = find_pad(rig, robot if args.takeover else None)
+            assert self.pad is not None
             self.marks = {mapping.actions[name]: mark for name, mark in MARKS.items() if name in mapping.actions}
             if args.takeover:
                 self.takeover = Takeover(make_teleop(self.robot, self.pad, mapping), self.pad)

@@ -262,8 +262,8 @@ class Leader(Gamepad):
 
 def make_leader(driver: LeaderDriver, pads: Mapping[str, Gamepad]) -> Leader:
     """Return a leader with its dead-man, or else the first of the rig's gamepads for its buttons."""
-    wanted = driver.leader.deadman
-    return Leader(driver, pads.get(wanted) if wanted else next(iter(pads.values()), None))
+    wanted = driver.leader.deadman or next((name for name, pad in pads.items() if not isinstance(pad, Leader)), "")
+    return Leader(driver, pads.get(wanted))
 
 
 def explain_unguarded(name: str) -> str:

@@ -55,7 +55,7 @@ class Rig:
         self.robots: Devices[Robot] = Devices("robot")
         self.cameras: Devices[Camera] = Devices("camera")
         self.gamepads: Devices[Gamepad] = Devices("gamepad")
-        """Leader arms, then gamepads."""
+        """Gamepads, then leader arms."""
         self.world: World = NoWorld()  # type: ignore[assignment]  # every use of it raises NotSupported
         self.clock: Clock = RealClock()
         self.notes: list[str] = list(plan.warnings)
@@ -205,14 +205,13 @@ class Rig:
         )
 
     def _open_pads(self, pads: Sequence[Chosen]) -> None:
-        opened: dict[str, Gamepad] = {}
-        for chosen in sorted(pads, key=lambda chosen: chosen.spec.leader is not None):  # their dead-men first
+        for chosen in pads:
             self.notes.extend(chosen.notes)
             spec = chosen.spec
             driver = registry.load(spec.driver, spec.kind)(spec, self._pad_source(chosen))
-            gamepad = Gamepad(driver) if spec.leader is None else make_leader(driver, opened)
+            gamepad = Gamepad(driver) if spec.leader is None else make_leader(driver, self.gamepads)
             self._devices[spec.name] = driver
-            opened[spec.name] = gamepad
+            self.gamepads[spec.name] = gamepad
             gamepad.open(self.clock.now())
             self.notes.extend(gamepad.notes)
             if self.lock_step:
@@ -222,7 +221,6 @@ class Rig:
             if chosen.input == "console" and self.console is not None:
                 # A program that waits for a dead-man would seem to hang. Apps print a banner instead.
                 logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
-        self.gamepads.update((chosen.spec.name, opened[chosen.spec.name]) for chosen in pads)
 
     def _pad_source(self, chosen: Chosen) -> object | None:
         """Return the second argument of a gamepad driver: the console, this rig's stop, or the world's time."""

@@ -476,7 +476,7 @@ class Plan:
     robots: tuple[RobotSpec, ...]
     cameras: tuple[CameraSpec, ...]
     pads: tuple[PadSpec, ...]
-    """Leader arms, then gamepads."""
+    """Gamepads, then leader arms."""
     renderer: str
     """Renderer of simulated images: ``auto``, ``gl`` or ``tiny``."""
     warnings: tuple[str, ...]

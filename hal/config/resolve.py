@@ -45,7 +45,7 @@ def resolve(context: Context) -> Plan:
     _check_names(context)
     robots = _resolve_all(context, "robots", resolve_robot)
     cameras = _resolve_all(context, "cameras", resolve_camera)
-    pads = _resolve_all(context, "leaders", resolve_leader) + _resolve_all(context, "gamepads", resolve_pad)
+    pads = _resolve_all(context, "gamepads", resolve_pad) + _resolve_all(context, "leaders", resolve_leader)
     with suppress(Unknown):
         _check_clock(context)
     _check_rates(context, robots)

@@ -167,7 +167,7 @@ class Turning(LeaderDriver):
 
 def test_joints_are_by_sign_scale_and_offset_in_the_usual_turn_and_without_leaps() -> None:
     values = {"signs": [1, -1, 1, 1, -1], "offsets": [0, 1.0, 0, 0, 3.0], "scales": [1, 1, 2, 1, 0.5]}
-    spec = load(config("so101", **values), driver="mock").resolve().pads[0]
+    spec = load(config("so101", **values), driver="mock").resolve().pads[-1]
     leader = Turning(spec)
     leader.open()
     leader.angles = [0.1 + 2 * math.pi, 0.5 - 4 * math.pi, 0.2, 3.1, 2.0]
