@@ -130,7 +130,8 @@ class ServoArm(RobotDriver):
         commanded = self._find_commanded(states) if self.engaged else None
         fault = self._judge(states, q, commanded)
         if self.engaged and self._sent and not self._written:
-            self.write(self._sent[-1][1])  # between sessions it creeps on
+            still = (0.0,) * len(q)
+            self.write(Setpoint(self._sent[-1][1].q, still, still))  # between sessions it creeps on
         self._written = False
         reading = Reading(t, t, self._seq, q, dq, fault=fault)
         if commanded is None or not self.engaged:
