@@ -277,14 +277,14 @@ def check_everything(plan: Plan, args: argparse.Namespace) -> None:
     if args.listen is not None:
         Listen.parse(args.listen).check()
     pads = check_opening(plan, args.pad, args.viewer, args.console or args.listen is not None)
-    for robot in plan.robots:
+    for robot in (robot for robot in plan.robots if robot.at is None):
         registry.load(robot.driver, "robot")
         if robot.gripper is not None:
             registry.load(robot.gripper.driver, "gripper")
     for camera in plan.cameras:
         registry.load(camera.driver, "camera")
     for chosen in pads:
-        registry.load(chosen.spec.driver, "gamepad")(chosen.spec)  # checks its options; opens nothing
+        registry.load(chosen.spec.driver, chosen.spec.kind)(chosen.spec)  # checks its options; opens nothing
 
 
 def _world_warnings(plan: Plan) -> list[str]:

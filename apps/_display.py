@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
-from urllib.parse import urlsplit
 
 from hal import registry
 
@@ -33,12 +32,12 @@ def banner(rig: Rig) -> str:
     plan = rig.plan
     lines = [f"rig      {plan.source}"]
     for line in list_devices(plan):
-        if line.startswith("gamepad"):
+        if line.startswith(("gamepad", "leader")):
             continue
         lines.append(line)
         if line.startswith("world") and rig.renderer:
             lines.append(f"renderer {rig.renderer}")
-    lines.extend(f"gamepad  {pad.name:10s} {pad.describe()}" for pad in rig.gamepads.values())
+    lines.extend(f"{pad.driver.spec.kind:8s} {pad.name:10s} {pad.describe()}" for pad in rig.gamepads.values())
     lines.extend(f"note     {note}" for note in rig.notes)
     return "\n".join(f"  {line}" for line in lines)
 
@@ -53,7 +52,8 @@ def list_devices(plan: Plan) -> list[str]:
         hand = f", gripper {gripper.width_min:g}..{gripper.width_max:g} m" if gripper else ""
         if gripper and robot.attended and simulated:
             hand += f", {_real(robot, gripper)}"
-        lines.append(f"robot    {robot.name:10s} {robot.model}, {where}, {robot.rate_hz:g} Hz{hand}")
+        at = "" if robot.at is None else f" at {robot.at}"
+        lines.append(f"robot    {robot.name:10s} {robot.model}{at}, {where}, {robot.rate_hz:g} Hz{hand}")
         if robot.attended:
             lines.append(f"limits   {robot.name:10s} {_limits(robot)}")
     for camera in plan.cameras:
@@ -62,7 +62,7 @@ def list_devices(plan: Plan) -> list[str]:
             f"camera   {camera.name:10s} {camera.model} ({camera.driver}{_image_source(camera)}), "
             f"{camera.width}x{camera.height} {streams} at {camera.rate_hz:g} Hz"
         )
-    lines.extend(f"gamepad  {pad.name:10s} {_pad(pad)}" for pad in plan.pads)
+    lines.extend(f"{pad.kind:8s} {pad.name:10s} {_pad(pad)}" for pad in plan.pads)
     if plan.world is not None:
         bodies = ", ".join(body.name for body in plan.world.bodies) or "empty"
         lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {bodies}")
@@ -73,14 +73,19 @@ def list_devices(plan: Plan) -> list[str]:
 
 def _missing_libraries(plan: Plan) -> dict[str, str]:
     """Return the libraries of arms and grippers that are not installed -> the command that installs each."""
-    devices = [device for robot in plan.robots for device in (robot, robot.gripper) if device is not None]
+    here = [robot for robot in plan.robots if robot.at is None]
+    devices = [device for robot in here for device in (robot, robot.gripper) if device is not None]
     return {name: command for one in devices for name, command in registry.find_missing(one.driver, one).items()}
 
 
 def _pad(pad: PadSpec) -> str:
-    """Return the model of a gamepad if the rig names one, its driver, and the arm that it drives."""
+    """Return the model of a gamepad or leader if the rig names one, its driver, and the arm that it drives."""
     model = "" if pad.model is None else f"{pad.model['title']}, "
-    return f"{model}{pad.driver}{'' if pad.drives is None else f', drives {pad.drives}'}"
+    drives = "" if pad.drives is None else f", drives {pad.drives}"
+    if (leader := pad.leader) is None:
+        return f"{model}{pad.driver}{drives}"
+    held = leader.deadman or ("its lever" if leader.may_drive_real else "none")
+    return f"{leader.title}, {pad.driver} at {pad.options.get('port', 'no port')}, dead-man: {held}{drives}"
 
 
 def _image_source(camera: CameraSpec) -> str:
@@ -123,13 +128,6 @@ def list_links(rig: Rig) -> str:
         ]
         if rig.console.tunnel:
             lines += ["  On another computer, run this first:", "", f"      {rig.console.tunnel}", ""]
-    if rig.viewer3d is not None:
-        if not lines:
-            lines.append("")
-        lines += ["  3D view, on this computer:", "", f"      {rig.viewer3d.link}", ""]
-        if rig.console is not None and rig.console.tunnel:
-            port = urlsplit(rig.viewer3d.link).port
-            lines += [f"  (on another computer, add to the ssh command: -L {port}:127.0.0.1:{port})", ""]
     return "\n".join(lines)
 
 

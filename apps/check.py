@@ -390,7 +390,7 @@ def parser() -> argparse.ArgumentParser:
 def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
     from hal.config import load
-    from hal.preflight import list_checked_cameras, list_real_arms, preflight
+    from hal.preflight import list_checked_cameras, list_leaders, list_real_arms, preflight
 
     if args.pads:
         return _pads(args)
@@ -410,7 +410,7 @@ def main(args: argparse.Namespace) -> int:
         print(json.dumps({"rig": plan.source, "fit": _fit(found), "verdicts": [asdict(v) for v in found]}, indent=2))
     else:
         found = _print_results(verdicts)
-        if not list_real_arms(plan) and not list_checked_cameras(plan):
+        if not list_real_arms(plan) and not list_checked_cameras(plan) and not list_leaders(plan):
             print("no device checks for this rig; checked this computer only")
     return 0 if _fit(found) else ACTION_NEEDED
 
@@ -430,7 +430,8 @@ def _pads(args: argparse.Namespace) -> int:
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
     of_a_rig = args.overrides or args.config != parser().get_default("config")
-    pads = load(**config_options(args)).resolve().pads if of_a_rig else ()
+    known = load(**config_options(args)).resolve().pads if of_a_rig else ()
+    pads = [pad for pad in known if pad.leader is None]
     return 0 if show_pads(pads, args.duration) else ACTION_NEEDED
 
 

@@ -81,7 +81,7 @@ def parser() -> argparse.ArgumentParser:
     _add_trim_options(add("trim", "remove the rows at both ends of episodes in which neither arm nor gripper moves"))
     add("pack", "join the files of episodes, which recorders do from 100 on")
     add("check", "compare every file with the index")
-    add("repair", "finish interrupted episodes, rebuild a lost index, and close grasps of earlier versions")
+    add("repair", "finish interrupted episodes and rebuild a lost index")
     return made
 
 

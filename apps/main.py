@@ -32,6 +32,7 @@ PROGRAMS = {
     "dataset": "list, mark, delete, trim, merge, split and check recorded episodes",
     "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
+    "serve": "serve the arms of this computer to a program on another one",
     "serve-lerobot": "serve a policy that was trained with LeRobot, for rollout",
     "generate": "generate a dataset in simulation, on several workers",
     "grasp": "find an object and grasp it",
@@ -56,6 +57,7 @@ LISTS = {
     "cameras": ("sensors", "cameras"),
     "rigs": ("config",),
     "pads": ("sensors", "gamepads"),
+    "leaders": ("sensors", "leaders"),
 }
 """Kind of built-in file -> its folder."""
 

@@ -112,9 +112,7 @@ def _describe_replay(robot: Robot, episode: Episode) -> Iterator[str]:
     except DatasetError as error:
         yield f"damaged  {error}; images are not needed here"
     if robot.gripper is not None and GRIP_FORCE not in episode.columns:
-        touches = "grasps" not in episode.info or episode.info["grasps"]["unknown"]
-        rest = "grasps of scripts and skills may only touch" if touches else "the fingers press with their own"
-        yield f"fingers  this recording lacks the gripper's force: {rest}"
+        yield "fingers  this recording lacks the gripper's force: grasps of scripts and skills may only touch"
     for name in list_other_arms(episode, robot.name):
         yield f"still    {name} moved in the recording; it is not replayed"
 

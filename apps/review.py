@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     files.add_argument(
         "--repair",
         action="store_true",
-        help="finish interrupted episodes, rebuild a lost index, and close grasps of earlier versions",
+        help="finish interrupted episodes and rebuild a lost index",
     )
     made.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
     made.add_argument("--force", action="store_true", help="overwrite an existing picture or .rrd file")

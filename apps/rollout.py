@@ -262,10 +262,10 @@ class RolloutRun:
         button: str,
     ) -> None:
         """Prepare to run a policy; the last three arguments are those of the pad; None, and "", without a dead-man."""
+        from hal.leading import make_teleop
         from hal.learning.asynchronous import RemotePolicy
         from hal.learning.policy import PolicyRunner
         from hal.learning.takeover import Takeover
-        from hal.teleop import Teleop
 
         self.rig, self.args, self.recorder, self.deadman = rig, args, recorder, deadman
         self.remote = policy if isinstance(policy, RemotePolicy) else None
@@ -286,7 +286,7 @@ class RolloutRun:
             self.pad = next(iter(rig.gamepads.values()))
             self.marks = {mapping.actions[name]: mark for name, mark in MARKS.items() if name in mapping.actions}
             if args.takeover:
-                self.takeover = Takeover(Teleop(self.robot, mapping), self.pad)
+                self.takeover = Takeover(make_teleop(self.robot, self.pad, mapping), self.pad)
         self.line, self._noted, self._next_note = StatusLine(), "", 0.0
         if recorder is not None:
             recorder.source = self._driver

@@ -1,6 +1,6 @@
 """Who may connect to a page: pages that this server sent, addressed by a name of this machine, with the link's token.
 
-The guard of the console and of the 3D view. Also the console's address in the forms that people and browsers use: link,
+The guard of the console. Also the console's address in the forms that people and browsers use: link,
 ssh tunnel, names of this machine.
 """
 

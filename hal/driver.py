@@ -525,6 +525,8 @@ class PadReading(NamedTuple):
     connected: bool
     unknown: Collection[str] = ()
     """Axes that the pad has not reported yet; their value is 0, and no control counts until they have moved."""
+    joints: tuple[float, ...] = ()
+    """Joint positions of a leader arm (n,), rad; empty for a gamepad."""
 
 
 class Plugged(NamedTuple):

@@ -57,6 +57,9 @@ class Gamepad:
         driver: Driver of the pad.
     """
 
+    guard: Gamepad | None = None
+    """Another pad whose buttons it has; None for most (see :class:`hal.leader.Leader`)."""
+
     def __init__(self, driver: GamepadDriver) -> None:
         self.driver = driver
         self.name = driver.spec.name
@@ -237,10 +240,9 @@ class Gamepad:
             for held in self._held.values():
                 held.update(reading, gate_open=live)
             last = self._state
-            state = PadState(
-                Stamp(reading.t, reading.t_device, reading.seq), MappingProxyType(axes), buttons, reading.connected
-            )
-            same = (last.axes, last.buttons, last.connected) == (axes, buttons, state.connected)
+            stamp, joints = Stamp(reading.t, reading.t_device, reading.seq), reading.joints
+            state = PadState(stamp, MappingProxyType(axes), buttons, reading.connected, joints)
+            same = (last.axes, last.buttons, last.connected, last.joints) == (axes, buttons, state.connected, joints)
             if same and last.stamp == state.stamp:
                 return
             self._state = state

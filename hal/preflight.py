@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import os
 import resource
+import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from . import registry
 from .errors import HalError
-from .specs import CameraSpec, GripperSpec, RobotSpec
+from .specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 if TYPE_CHECKING:
     from .driver import CameraDriver
@@ -58,7 +61,7 @@ def preflight(
         plan: The resolved rig.
         duration: Time for which each arm's network and each camera's rate is measured, s.
         machine: Whether to check this computer.
-        cameras: Whether to check the cameras.
+        cameras: Whether to check the cameras, and the leader arms.
     """
     if machine:
         yield from check_machine()
@@ -72,16 +75,46 @@ def preflight(
     for device in devices:
         for result in _check(device, duration):
             yield replace(result, name=f"{device.name}: {result.name}")
+    for leader in list_leaders(plan) if cameras else ():
+        yield _check_leader(leader, duration)
 
 
 def list_real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
-    """Return the arms of a rig that are real or emulated."""
-    return tuple(robot for robot in plan.robots if robot.attended or robot.emulated)
+    """Return the arms of a rig that are real or emulated, and at this computer: another one checks its own."""
+    return tuple(robot for robot in plan.robots if robot.at is None and (robot.attended or robot.emulated))
 
 
 def list_checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
     """Return the cameras of a rig whose driver can check them before they are opened."""
     return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
+
+
+def list_leaders(plan: Plan) -> tuple[PadSpec, ...]:
+    """Return the leader arms of a rig that are real or emulated."""
+    leaders = (pad for pad in plan.pads if pad.leader is not None)
+    return tuple(spec for spec in leaders if not registry.load(spec.driver, "leader").simulated)
+
+
+def _check_leader(spec: PadSpec, duration: float) -> CheckResult:
+    """Read a leader for a while: what it is, whether it answers, and how often."""
+    name = f"{spec.name}: leader"
+    driver = registry.load(spec.driver, "leader")(spec)
+    driver.open()
+    try:
+        end, times = time.monotonic() + duration, set[float]()
+        while (now := time.monotonic()) < end:
+            reading = driver.poll(now, 0.01)
+            times.add(reading.t_alive)
+        found = driver.describe()
+    finally:
+        driver.close()
+    if not reading.connected:
+        cause, _, remedy = found.partition("; ")
+        return CheckResult(name, "fail", cause, remedy)
+    rate = (len(times) - 1) / duration
+    levels: tuple[Level, Level] = ("ok", "warn")
+    remedy = "connect its adapter directly; end busy programs"
+    return CheckResult(name, levels[rate < 80.0], f"{found}, {rate:.0f} readings per second", remedy)
 
 
 def _check_engine(engine: str) -> CheckResult:
@@ -134,6 +167,10 @@ _FIRST, _GRAB = 5.0, 0.2
 """Longest time until the first frame of a camera, and of one wait for a later one, s."""
 _SLOW, _LOSSY = 0.95, 0.02
 """Share of the nominal rate below which, and share of lost frames above which something is wrong."""
+_FAR, _TURNED = 0.001, 0.005
+"""Difference of two tcps that is named, m and rad."""
+_LATE = 2.5
+"""Periods without a state from which one is late."""
 
 
 def check_frames(driver: CameraDriver, duration: float, slow: str, lossy: str, silent: str) -> CheckResult:
@@ -167,6 +204,77 @@ def check_frames(driver: CameraDriver, duration: float, slow: str, lossy: str, s
     if lost > _LOSSY * taken:
         return CheckResult("frames", "warn", found, lossy)
     return CheckResult("frames", "ok", found)
+
+
+def probe_ports(host: str, ports: Mapping[int, bytes | None], timeout: float = 1.0) -> str:
+    """Return why a controller does not answer, naming the port; an empty text if it does.
+
+    Args:
+        host: Its address.
+        ports: Ports, each with the request that it must answer: empty if it speaks first, None if it need not speak.
+        timeout: Longest time for each, s.
+    """
+    for port, request in ports.items():
+        try:
+            with socket.create_connection((host, port), timeout) as line:
+                if request is not None:
+                    line.sendall(request)
+                    if not line.recv(64):
+                        return f"port {port} of {host} hangs up"
+        except OSError as error:
+            return f"port {port} of {host}: {error.strerror or error}"
+    return ""
+
+
+def compare_tcp(distance: float, turn: float, remedy: str) -> CheckResult:
+    """Return whether the tcp of an arm's controller is that of the model, from how far they are apart, m and rad."""
+    found = f"{1e3 * distance:.1f} mm and {turn:.3f} rad between the controller's and the model's"
+    same = distance <= _FAR and turn <= _TURNED
+    return CheckResult("tcp", "ok", found) if same else CheckResult("tcp", "warn", found, remedy)
+
+
+def compare_payload(
+    wanted: tuple[float, Sequence[float]] | None, mass: float, com: Sequence[float], place: str
+) -> CheckResult:
+    """Compare the payload that an arm's controller has with the rig's.
+
+    Args:
+        wanted: The rig's mass, kg, and centre of mass, m; None to leave the controller's.
+        mass: The controller's, kg.
+        com: Its centre of mass, m.
+        place: Where the controller has it, in words.
+    """
+    found = f"{mass:.2f} kg at [{', '.join(f'{value:.3f}' for value in com)}] m in {place}"
+    if wanted is None:
+        return CheckResult("payload", "ok", f"{found}; real.load is not set, so it stays")
+    if abs(wanted[0] - mass) < 0.01 and max(abs(a - b) for a, b in zip(wanted[1], com, strict=True)) < 0.002:
+        return CheckResult("payload", "ok", f"{found}, as the rig has it")
+    found += f"; the rig has {wanted[0]:g} kg at {list(wanted[1])} m"
+    remedy = "the rig's is set when a session opens; correct the wrong one"
+    return CheckResult("payload", "warn", found, remedy)
+
+
+def measure_gaps(name: str, receive: Callable[[], int], period: float, duration: float) -> CheckResult:
+    """Measure when states come.
+
+    Args:
+        name: What they are called.
+        receive: Returns how many have come since it was last called.
+        period: Time between two, s.
+        duration: How long to measure, s.
+    """
+    end = time.monotonic() + max(duration, 0.2)
+    receive()
+    times: list[float] = []
+    while time.monotonic() < end:
+        time.sleep(2e-4)
+        times += [time.monotonic()] * receive()
+    gaps = [b - a for a, b in pairwise(times)] or [inf]
+    late = sum(gap > _LATE * period for gap in gaps)
+    found = f"{len(times)} {name}, longest gap {1e3 * max(gaps):.1f} ms, {late} late"
+    if late <= len(times) // 100:
+        return CheckResult(name, "ok", found)
+    return CheckResult(name, "warn", found, "connect the cable directly, end busy programs, use a real-time kernel")
 
 
 # This computer

@@ -77,6 +77,8 @@ class DriverSpec:
     """A :class:`~hal.driver.CameraDriver`."""
     gamepad: str | None = None
     """A :class:`~hal.driver.GamepadDriver`."""
+    leader: str | None = None
+    """A :class:`~hal.leader.LeaderDriver`."""
     world: str | None = None
     """A :class:`~hal.world.WorldDriver`, which makes this driver an engine of the simulation: the world of its arms,
     grippers and cameras."""
@@ -101,9 +103,10 @@ class DriverSpec:
     pad_title: str = ""
     """A few words for :attr:`pad_input`, for status messages."""
     checks: Mapping[str, str] = field(default_factory=dict)
-    """Kind of device (``robot``, ``gripper``, ``camera``, ``gamepad``) -> "module:function", which checks the resolved
-    record of such a device before anything is opened. It yields (key, message, code) for each mistake; keys are
-    relative to the device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
+    """Kind of device (``robot``, ``gripper``, ``camera``, ``gamepad``, ``leader``) -> "module:function", which checks
+    the resolved record of such a device before anything is opened. It yields (key, message, code) for each mistake;
+    keys are relative to the device's entry in the rig, for example ``real.host``. It must not import the driver's
+    libraries."""
     emulated: str | None = None
     """"module:function" that returns whether the options of a real device name an emulator on this computer."""
     steppable: bool = True
@@ -145,7 +148,7 @@ class DriverSpec:
 
 
 _VIEWS = ("viewer", "viewer3d", "pictures", "software_renderer", "console")
-_KINDS = ("robot", "gripper", "camera", "gamepad", "world", *_VIEWS)
+_KINDS = ("robot", "gripper", "camera", "gamepad", "leader", "world", *_VIEWS)
 
 
 def names() -> tuple[str, ...]:

@@ -23,8 +23,9 @@ from .commands import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
-from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups
+from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups, start_processes
 from .host.process import SharedMemory
+from .leader import explain_unguarded, make_leader
 from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad
 from .robot import Robot
@@ -112,6 +113,7 @@ class Rig:
         self.robots: Devices[Robot] = Devices("robot")
         self.cameras: Devices[Camera] = Devices("camera")
         self.gamepads: Devices[Gamepad] = Devices("gamepad")
+        """Leader arms, then gamepads."""
         self.world: World = NoWorld()  # type: ignore[assignment]  # every use of it raises NotSupported
         self.clock: Clock = RealClock()
         self.notes: list[str] = list(plan.warnings)
@@ -121,7 +123,7 @@ class Rig:
         self.console: Console | None = None
         """The page in a browser; None if it is not served."""
         self.viewer3d: Viewer3D | None = None
-        """The page with the arms in 3D; None if it is not served."""
+        """The view of the arms in 3D on the console's page; None if there is none."""
         self._pictures: CameraRenderer | None = None
         self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
@@ -142,12 +144,12 @@ class Rig:
         pads = check_opening(plan, pad, viewer, console)
         groups = make_groups(plan)
         world_host = self._start_hosts(groups, realtime)
-        if console or any(chosen.input == "console" for chosen in pads):
+        if viewer == "3d":
+            self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
+        if console or viewer == "3d" or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)
         if world_host is not None:
             self._open_world_views(world_host, viewer)
-        if viewer == "3d":
-            self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
         self._wait_for_hosts(realtime)
         if world_host is not None:
             self.world = World(world_host.request, partial(self._pass_on_edit, world_host), self.plan.world)
@@ -157,7 +159,7 @@ class Rig:
                 gripper, collisions = self._make_gripper(spec), plan.collisions
                 robot = Robot(spec, host, self.clock, gripper, collisions, self.robots)
                 self.robots[spec.name] = robot
-        for opened in (self.console, self.viewer3d):
+        for opened in (self.viewer3d, self.console):
             if opened is not None:
                 opened.wait_ready()
                 self.notes.extend(opened.notes)
@@ -191,32 +193,22 @@ class Rig:
         self.notes.append(f"real-time priority (SCHED_FIFO) is refused: a busy computer delays the servos; {remedy}")
 
     def _start_hosts(self, groups: Sequence[GroupSpec], realtime: bool) -> Host | None:
-        """Start the processes of the groups; return the one with the simulated world.
-
-        That one is started last, because it mirrors the arms of the others.
-        """
-        world_host: Host | None = None
-        single = self.lock_step and len(groups) == 1  # needs no memory that another process can read
+        """Start the processes of the groups; return the one with the simulated world."""
+        if not self.lock_step:
+            for host in start_processes(groups, realtime, self._latch):
+                self._hosts.append(host)
+            return next((host for host in self._hosts if host.spec.world is not None), None)
+        single = len(groups) == 1  # needs no memory that another process can read
         memories = [] if single else [(group, RemoteHost.allocate(group)) for group in groups]
-        if self.lock_step:
-            stepped = [
-                SteppedHost(group, shared=shared, others=[] if group.robots else memories, latch=self._latch)
-                for group, shared in memories[1:]
-            ]
-            self._hosts.extend(stepped)
-            local = LocalHost(groups[0], stepped, self._latch, None if single else memories[0][1])
-            self._hosts.insert(0, local)
-            self.clock = LockStepClock(local.now, local.advance_to)
-            return local if local.spec.world is not None else None
-        for group, shared in sorted(memories, key=lambda pair: pair[0].world is not None):
-            seen = group.world is not None or bool(group.neighbours) or not group.robots
-            others_ = [pair for pair in memories if seen and pair[0] is not group]
-            urgent = realtime and bool(group.robots)
-            host = RemoteHost(group, realtime=urgent, shared=shared, others=others_, latch=self._latch)
-            self._hosts.append(host)
-            if group.world is not None:
-                world_host = host
-        return world_host
+        stepped = [
+            SteppedHost(group, shared=shared, others=[] if group.robots else memories, latch=self._latch)
+            for group, shared in memories[1:]
+        ]
+        self._hosts.extend(stepped)
+        local = LocalHost(groups[0], stepped, self._latch, None if single else memories[0][1])
+        self._hosts.insert(0, local)
+        self.clock = LockStepClock(local.now, local.advance_to)
+        return local if local.spec.world is not None else None
 
     def _make_gripper(self, robot: RobotSpec) -> Gripper | None:
         spec = robot.gripper
@@ -262,13 +254,14 @@ class Rig:
         )
 
     def _open_pads(self, pads: Sequence[Chosen]) -> None:
-        for chosen in pads:
+        opened: dict[str, Gamepad] = {}
+        for chosen in sorted(pads, key=lambda chosen: chosen.spec.leader is not None):  # their dead-men first
             self.notes.extend(chosen.notes)
             spec = chosen.spec
-            driver = registry.load(spec.driver, "gamepad")(spec, self._pad_source(chosen))
-            gamepad = Gamepad(driver)
+            driver = registry.load(spec.driver, spec.kind)(spec, self._pad_source(chosen))
+            gamepad = Gamepad(driver) if spec.leader is None else make_leader(driver, opened)
             self._devices[spec.name] = driver
-            self.gamepads[spec.name] = gamepad
+            opened[spec.name] = gamepad
             gamepad.open(self.clock.now())
             self.notes.extend(gamepad.notes)
             if self.lock_step:
@@ -278,6 +271,7 @@ class Rig:
             if chosen.input == "console" and self.console is not None:
                 # A program that waits for a dead-man would seem to hang. Apps print a banner instead.
                 logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
+        self.gamepads.update((chosen.spec.name, opened[chosen.spec.name]) for chosen in pads)
 
     def _pad_source(self, chosen: Chosen) -> object | None:
         """Return the second argument of a gamepad driver: the console, this rig's stop, or the world's time."""
@@ -507,7 +501,8 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     Raises:
         DriverMissing: The engine of the simulated world, or the libraries of a page, are not installed.
         DeviceNotFound: No such pad.
-        NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
+        NotSupported: A viewer or a console that this rig cannot have, or a recording, or a leader without a dead-man,
+            for a real arm.
         ConfigError: A recording that cannot be played.
     """
     if plan.engine is not None:
@@ -515,6 +510,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     lock_step = plan.clock == "lock_step"
     known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
+    _check_leaders(plan, pads)
     pages = [chosen for chosen in pads if chosen.input == "console"]
     for chosen in pages[1:]:
         note = "the page is one pad, and drives one arm at a time; for the other one, plug in a gamepad"
@@ -522,7 +518,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     wrong = [
         Problem("--pad", "", message, code)
         for chosen in pads
-        for _, message, code in registry.check_record(chosen.spec.driver, "gamepad", chosen.spec)
+        for _, message, code in registry.check_record(chosen.spec.driver, chosen.spec.kind, chosen.spec)
     ]
     if wrong:
         raise ConfigError(wrong)
@@ -534,13 +530,21 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
         )
     if viewer == "3d":
         registry.load(registry.provider("viewer3d"), "viewer3d")
-    if console or any(chosen.input == "console" for chosen in pads):
+    if console or viewer == "3d" or any(chosen.input == "console" for chosen in pads):
         if lock_step:
             raise NotSupported(
                 "the console needs real time; in lock-step, time runs as fast as the program", code="needs_real_time"
             )
         registry.load(registry.provider("console"), "console")
     return pads
+
+
+def _check_leaders(plan: Plan, pads: Sequence[Chosen]) -> None:
+    """Refuse a leader without a dead-man where something real moves. Raises NotSupported."""
+    for chosen in pads:
+        leader = chosen.spec.leader
+        if leader is not None and not leader.may_drive_real and plan.attended and not plan.emulated:
+            raise NotSupported(explain_unguarded(chosen.spec.name), code="deadman_not_trusted")
 
 
 class Devices(dict[str, T]):

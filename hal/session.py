@@ -22,6 +22,7 @@ from .errors import (
     RobotFault,
     StaleStateError,
 )
+from .leading import make_teleop
 from .learning.episode import reset_scene, stands_in_world
 from .teleop import HOMING_PATIENCE, STILL, ArmTeleop, SessionEventKind, Teleop, share_pads
 from .views import DrivingView
@@ -144,7 +145,7 @@ class TeleopSession:
         pads = _list_given(pad, list(rig.gamepads.values()), missing, "no_gamepad")
         self._several = len(robots) > 1
         self.arms = tuple(
-            ArmTeleop(arms, pad, mapping, speed, self._announce) for pad, arms in share_pads(robots, pads)
+            ArmTeleop(arms, pad, mapping, speed, self._announce, make_teleop) for pad, arms in share_pads(robots, pads)
         )
         """The arms that are driven at once, each with its pad."""
         self._arm = self.arms[0]
@@ -396,10 +397,10 @@ class TeleopSession:
         self._arm = arm
         state = arm.pad.state()
         fresh, arm.seen = state.stamp.seq != arm.seen, state.stamp.seq
-        motion, grip = arm.teleop.step(state, dt)
-        if arm.held_for:
-            motion, grip = STILL, None
         try:
+            motion, grip = arm.teleop.command(state, dt)
+            if arm.held_for:
+                motion, grip = STILL, None
             motion = arm.follow_gizmo(motion, self.rig.viewer3d)
             control.send(motion, grip=grip, t_event=state.stamp.t if fresh else 0.0)
             arm.note_resumed()

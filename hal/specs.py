@@ -181,6 +181,8 @@ class RobotSpec:
     """Options of the driver (``real:`` or ``simulated:`` of the rig's file)."""
     source: str = ""
     """The rig's file, or ``<dict>``."""
+    at: str | None = None
+    """Address of the computer that serves this arm; None if it is at this one."""
 
 
 @dataclass(frozen=True)
@@ -344,8 +346,40 @@ class CameraSpec:
 
 
 @dataclass(frozen=True)
+class LeaderSpec:
+    """A leader arm: how the angles of its motors become joint positions, gain * (angle - offset), and what leads."""
+
+    title: str
+    joints: tuple[str, ...]
+    gains: Floats
+    offsets: Floats
+    """rad"""
+    middles: Floats
+    """Joint position around which the turn of each motor is chosen when it connects, rad."""
+    leads: tuple[str, ...]
+    """Models of arms that it leads joint to joint; any other one by poses."""
+    kinematics: KinematicsSpec | None
+    """Its own kinematics, to lead by poses; None if it leads joint to joint only."""
+    pose_scale: float
+    """Way of the led tcp for each m of its own, if it leads by poses."""
+    engage: str
+    """``clutch``: the arm stays where it is and follows what the leader moves from then on. ``approach``: it also comes
+    to the leader's position, at its ``move_speed``."""
+    lever: str
+    """What its lever is: ``gripper``, ``deadman`` or ``none``."""
+    deadman: str | None
+    """Gamepad of the rig that must be held; None for the lever, or for no dead-man at all."""
+    emulated: bool = False
+
+    @property
+    def may_drive_real(self) -> bool:
+        """Whether it has a dead-man."""
+        return self.deadman is not None or self.lever == "deadman"
+
+
+@dataclass(frozen=True)
 class PadSpec:
-    """One gamepad on a rig."""
+    """One gamepad, or leader arm, on a rig."""
 
     name: str
     driver: str
@@ -359,6 +393,13 @@ class PadSpec:
     options: dict[str, Any] = field(default_factory=dict)
     real: bool = False
     """Whether a person must operate it, so that no recording is chosen for it."""
+    leader: LeaderSpec | None = None
+    """What a leader arm has beyond a gamepad; None for a gamepad."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of its driver: ``gamepad`` or ``leader``."""
+        return "gamepad" if self.leader is None else "leader"
 
 
 @dataclass(frozen=True)
@@ -377,6 +418,11 @@ class GroupSpec:
     """What its arms must not touch; None if nothing is checked."""
     neighbours: tuple[RobotSpec, ...] = ()
     """Arms of other groups that its arms must not touch."""
+
+    @property
+    def at(self) -> str | None:
+        """Address of the computer that serves these devices; None if they are at this one."""
+        return self.robots[0].at if self.robots else None
 
 
 @dataclass(frozen=True)
@@ -430,6 +476,7 @@ class Plan:
     robots: tuple[RobotSpec, ...]
     cameras: tuple[CameraSpec, ...]
     pads: tuple[PadSpec, ...]
+    """Leader arms, then gamepads."""
     renderer: str
     """Renderer of simulated images: ``auto``, ``gl`` or ``tiny``."""
     warnings: tuple[str, ...]

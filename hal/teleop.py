@@ -16,6 +16,7 @@ from .geometry import Pose, difference
 from .types import PadState
 
 if TYPE_CHECKING:
+    from .commands import Command
     from .gamepad import Gamepad
     from .gripper import Gripper
     from .robot import Robot
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 _CROSSED = 0.05
 """Distance between trigger and grip at which the trigger counts as having reached it, as a share of the travel."""
+_PRESSED = 0.05
+"""Share of a trigger's travel from which it counts as touched."""
 _HALF = 0.5
 """Share of its greatest width below which a gripper's target counts as closed."""
 _DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -86,6 +89,24 @@ class Teleop:
         self._was_toggle = True
         self._toggled = None
 
+    def prepare_takeover(self) -> None:
+        """Prepare for driving an arm only while :meth:`is_touched`, the dead-man being held all the time.
+
+        Raises:
+            CommandError: The mapping has no control for it.
+        """
+
+    def is_touched(self, pad: PadState) -> bool:
+        """Return whether a control is held that moves the arm or its gripper."""
+        if any(self.mapping.twist(pad)):
+            return True
+        gripper = self.mapping.gripper
+        if gripper is None:
+            return False
+        if gripper.axis is not None:
+            return pad.axis(gripper.axis) > _PRESSED
+        return any(pad.pressed(button) for button in (gripper.open, gripper.close, gripper.toggle) if button)
+
     def step(self, pad: PadState, dt: float) -> tuple[Twist, float | None]:
         """Return the command for a pad's state.
 
@@ -100,6 +121,10 @@ class Teleop:
         twist = self.mapping.twist(pad)
         linear, angular = ([self.speed * value for value in part] for part in (twist[:3], twist[3:]))
         return Twist(linear, angular, frame=self.frame), self._grip(pad)
+
+    def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
+        """Return the command and the grip for a state of the pad, or of a leader; as :meth:`step` for a pad."""
+        return self.step(pad, dt)
 
     def home_pressed(self, pad: PadState) -> bool:
         """Return whether the button that moves the arm home was pressed since the last call."""
@@ -303,10 +328,17 @@ class ArmTeleop:
         mapping: Name or file of the mapping; None for the one that the plugged-in pad is meant for.
         speed: Share of the mapping's speeds, above 0, at most 1.
         announce: Gets every event.
+        make: Returns what turns the pad's states into commands, for an arm, a pad, a mapping and a speed.
     """
 
     def __init__(
-        self, robots: Sequence[Robot], pad: Gamepad, mapping: str | None, speed: float, announce: Announce
+        self,
+        robots: Sequence[Robot],
+        pad: Gamepad,
+        mapping: str | None,
+        speed: float,
+        announce: Announce,
+        make: Callable[[Robot, Gamepad, str, float], Teleop],
     ) -> None:
         self.robots = tuple(robots)
         self.robot = self.robots[0]
@@ -327,7 +359,7 @@ class ArmTeleop:
         """Number of the pad's newest event that was turned into a command."""
         self.mapping = ""
         """Name or file of the mapping that is used."""
-        self._mapping_wanted, self._speed, self._announce = mapping, speed, announce
+        self._mapping_wanted, self._speed, self._announce, self._make = mapping, speed, announce, make
         self.load_mapping()
 
     def announce(self, text: str, kind: SessionEventKind, reason: str = "") -> None:
@@ -353,7 +385,7 @@ class ArmTeleop:
     def load_mapping(self) -> None:
         """Use the mapping that is due. Its dead-man must be released and pressed before it counts."""
         self.mapping = self.choose_mapping()
-        self.teleop = Teleop(self.robot, mapping=self.mapping, speed=self._speed)
+        self.teleop = self._make(self.robot, self.pad, self.mapping, self._speed)
         self.deadman = self.pad.hold(self.teleop.mapping.deadman)
 
     def other_pad_ready(self) -> bool:
@@ -379,11 +411,11 @@ class ArmTeleop:
         self.stopped = self.held_for = self.gripper_trouble = ""
         self.load_mapping()
 
-    def follow_gizmo(self, motion: Twist, view: Viewer3D | None) -> Twist:
+    def follow_gizmo(self, motion: Command, view: Viewer3D | None) -> Command:
         """Return the velocity towards the gizmo of the 3D view if it was dragged; moving a stick resets the gizmo."""
         name = self.robot.name
         goal = view.goal(name) if view is not None else None
-        if view is None or goal is None:
+        if view is None or goal is None or not isinstance(motion, Twist):
             return motion
         if motion.linear.any() or motion.angular.any() or self.held_for:
             view.clear_goal(name)
@@ -473,9 +505,10 @@ def share_pads(robots: Sequence[Robot], pads: Sequence[Gamepad]) -> list[tuple[G
 
     Args:
         robots: The arms to drive, at least one.
-        pads: The pads, at least one; those that are not needed are left out.
+        pads: The pads, at least one; those that are not needed, or are the dead-man of a leader, are left out.
     """
-    pads = _drop_shared(pads)
+    guards = [pad.guard for pad in pads]
+    pads = _drop_shared([pad for pad in pads if pad not in guards])
     left = {robot.name: robot for robot in robots}
     shared: list[tuple[Gamepad, list[Robot]]] = []
     for pad in pads:

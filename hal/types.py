@@ -385,6 +385,8 @@ class PadState:
     buttons: frozenset[str] = frozenset()
     """The buttons that are pressed; names of :data:`BUTTONS`."""
     connected: bool = False
+    joints: tuple[float, ...] = ()
+    """Joint positions of a leader arm (n,), rad; empty for a gamepad, and while it is not connected."""
 
     def axis(self, name: str) -> float:
         """Return the value of an axis; 0 if this pad does not have it. KeyError for a name not in :data:`AXES`."""

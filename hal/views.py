@@ -309,7 +309,7 @@ class Viewer(WorldView):
 
 
 class Viewer3D(WorldView):
-    """A page with a rig's arms in 3D, and a draggable handle on each tcp.
+    """A rig's arms in 3D on the console's page, with a draggable handle on each tcp.
 
     Args:
         rig: The rig.
@@ -320,8 +320,8 @@ class Viewer3D(WorldView):
 
     @property
     @abstractmethod
-    def link(self) -> str:
-        """Address to open in a browser."""
+    def address(self) -> str:
+        """Path of the Unix socket at which the view is served for the console, known from the start."""
 
     @abstractmethod
     def goal(self, robot: str) -> Pose | None:

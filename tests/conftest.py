@@ -41,7 +41,7 @@ FAST = {
     "lock_step": "whole rigs in simulation, in lock-step",
     "loops": "what a user does, from beginning to end: each row of the tables of docs/safety.md",
 }
-WITHOUT_FAST = ("not (fast", "browser or alone")
+WITHOUT_FAST = ("not (fast", "pair", "browser or alone")
 """How the expressions after -m of ``.ci/run`` begin that take no test of the fast tier."""
 OTHERS = {
     "wire": "drivers against emulated devices, through the vendors' client libraries",
@@ -56,6 +56,7 @@ MARKERS = {
     "fast": "tests of the fast tier (unit, contract, lock_step and loops, without the slow ones): what 'pytest' runs",
     "slow": "takes more than a few seconds; never in the fast tier",
     "alone": "drives in real time what a busy computer would stop: CI runs nothing beside it, as with all of 'browser'",
+    "pair": "drives in real time, and may share two processors with one other: CI runs two at once",
 }
 
 
@@ -126,7 +127,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     """
     if config.option.markexpr.startswith(WITHOUT_FAST) and _tier(collection_path) in FAST:
         text = collection_path.read_text(encoding="utf-8") if collection_path.suffix == ".py" else "slow"
-        return None if "slow" in text or "alone" in text else True
+        return None if any(mark in text for mark in ("slow", "alone", "pair")) else True
     if config.option.markexpr not in ("", "fast") or _tier(collection_path) not in OTHERS:
         return None
     return None if _touches(collection_path, _named(config)) else True

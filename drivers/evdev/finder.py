@@ -35,6 +35,8 @@ class NodeInfo(NamedTuple):
     is_joystick: bool = False
     """Whether it has the buttons of a joystick. Some gamepads have (Logitech's in D mode), and so have steering wheels:
     it is a pad only where a model matches it, or the rig names it."""
+    is_keyboard: bool = False
+    """Whether it has a keyboard's keys, as foot switches have: a pad only where the rig names its model."""
 
     def belongs_to(self, other: NodeInfo) -> bool:
         """Whether the two are parts of the same pad."""
@@ -146,6 +148,10 @@ class EvdevNode:
         """
         return lock_device(self._device.fd)
 
+    def grab(self) -> None:
+        """Keep the events of a keyboard from every other program, until it is closed."""
+        self._device.grab()
+
     def close(self) -> None:
         """Close the device. Idempotent."""
         self._device.close()
@@ -180,9 +186,9 @@ class LinuxInput:
                 bus=_hex(device / "id" / "bustype"),
                 driver=_kernel_driver(parent),
             )
-            is_pad, is_joystick = _classify(device / "capabilities")
+            kinds = _classify(device / "capabilities")
             uniq = _text(device / "uniq")
-            found.append(NodeInfo(str(self._devices / name), identity, uniq, parent, is_pad, is_joystick))
+            found.append(NodeInfo(str(self._devices / name), identity, uniq, parent, *kinds))
         return found
 
     def fingerprint(self) -> object:
@@ -222,8 +228,8 @@ def _hex(path: Path) -> int:
         return 0
 
 
-def _classify(capabilities: Path) -> tuple[bool, bool]:
-    """Return :attr:`NodeInfo.is_pad` and :attr:`NodeInfo.is_joystick`, from the events that the device can send."""
+def _classify(capabilities: Path) -> tuple[bool, bool, bool]:
+    """Return whether a device is a pad, a joystick and a keyboard (:class:`NodeInfo`), from the events it can send."""
     key, rel, axes = (_bits(capabilities / name) for name in ("key", "rel", "abs"))
 
     def has(bits: int, *codes: int) -> bool:
@@ -231,9 +237,10 @@ def _classify(capabilities: Path) -> tuple[bool, bool]:
 
     sticks = has(axes, ABS["ABS_X"])
     if has(key, KEY["BTN_SOUTH"]):
-        return sticks, False
+        return sticks, False, False
     six = has(rel, *(REL[f"REL_{n}"] for n in _SIX_AXES)) or has(axes, *(ABS[f"ABS_{n}"] for n in _SIX_AXES))
-    return six and has(key, KEY["BTN_0"]), sticks and has(key, KEY["BTN_TRIGGER"])
+    is_pad, is_joystick = six and has(key, KEY["BTN_0"]), sticks and has(key, KEY["BTN_TRIGGER"])
+    return is_pad, is_joystick, has(key, KEY["KEY_A"], KEY["KEY_B"], KEY["KEY_C"])
 
 
 def _bits(path: Path) -> int:

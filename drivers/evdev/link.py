@@ -57,6 +57,8 @@ class PadLink:
         self._dropping = False
         self._poller = select.poll()
         self._poller.register(node.fileno(), select.POLLIN)
+        if info.is_keyboard:  # the kernel knows its keys from the start, so that a pedal that is held shows as held
+            self._trust_kernel()
         self._rumble = Rumble(node.fileno(), RUMBLE_STRONG, RUMBLE_WEAK) if node.can_rumble else None
 
     @property

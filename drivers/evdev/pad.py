@@ -154,7 +154,8 @@ class EvdevPad(GamepadDriver):
             self._find_part(link, link.model.touch_node, nodes)
 
     def _find_pad(self, nodes: list[NodeInfo]) -> None:
-        pads = [info for info in nodes if info.is_pad or info.is_joystick]
+        named = self.spec.model is not None
+        pads = [info for info in nodes if info.is_pad or info.is_joystick or (named and info.is_keyboard)]
         wanted = [info for info in pads if self._is_wanted(info)]
         others = ", ".join(info.describe() for info in pads if info.is_pad)
         self.notes = (f"not the pad that the rig names: {others}",) if others and not wanted else ()
@@ -192,6 +193,8 @@ class EvdevPad(GamepadDriver):
             model, rule = guess_model(info.identity, node.axes, node.keys, node.rels), None
             self.notes = (*self.notes, guess_warning(model))
         try:
+            if info.is_keyboard:
+                node.grab()
             self._link = PadLink(info, node, model, rule)
         except OSError:  # unplugged again already
             node.close()

@@ -13,6 +13,7 @@ DRIVER = DriverSpec(
     gripper="hal.drivers.mock.robot:MockGripper",
     camera="hal.drivers.mock.camera:MockCamera",
     gamepad="hal.drivers.mock.gamepad:MockPad",
+    leader="hal.drivers.mock.leader:MockLeader",
     pad_input="program",
     pad_title="the program",
     stands_in=True,

@@ -58,6 +58,8 @@ class Motors:
         self._next = np.zeros((2, n))
         self._most = np.zeros((2, n))
         self._least = np.zeros((2, n))
+        self._shares = np.zeros(n)
+        """Share of each motor's limit that is applied."""
         self._to_acceleration = np.array([-1.0, 1.0, 1.0]) / h
 
     def bind(self, mujoco: Any, model: Any, data: Any) -> None:
@@ -93,7 +95,8 @@ class Motors:
         """Use new :attr:`efforts` and :attr:`speeds`."""
         self._most[0], self._most[1] = self.speeds, self.efforts * self._ease
         np.negative(self._most, out=self._least)
-        self._negative_efforts = -self.efforts
+        with np.errstate(divide="ignore"):
+            self._effort_shares = 1.0 / self.efforts
 
     def rest(self, at: Any, q: Floats | float) -> None:
         """Hold some joints at positions, and forget what their motors compensated."""
@@ -121,7 +124,7 @@ class Motors:
 
     def drive(self) -> None:
         """Set the torques of the next step; to be called when inertia and forces are those of the present state."""
-        state, new, force = self.state, self._next, self._driven_force
+        state, new = self.state, self._next
         state[_Q] = self._q
         state[_DQ] = self._dq
         self._law.dot(state, new)
@@ -131,11 +134,19 @@ class Motors:
         for at, *_ in self.torques.values():
             self._driven_acceleration[at] = 0.0
         self._mulm(self._model, self._data, self._force, self._acceleration)
-        np.add(force, self._bias, out=force)
+        applied = self.applied
+        np.add(self._driven_force, self._bias, out=applied)
         if self.torques:
             self._drive_by_torques()
-        applied = self.applied
-        np.maximum(force, self._negative_efforts, out=applied)
+        np.multiply(applied, self._effort_shares, out=self._shares)
+        if not self._shares.dot(self._shares) <= 1.0:  # else all of them are within their limits
+            self._cut()
+
+    def _cut(self) -> None:
+        """Cut the torques to the motors' limits."""
+        applied, force = self.applied, self._driven_force
+        np.copyto(force, applied)
+        np.maximum(force, -self.efforts, out=applied)
         np.minimum(applied, self.efforts, out=applied)
         np.subtract(applied, force, out=force)
         if force.dot(force) > 0.0:
@@ -151,7 +162,7 @@ class Motors:
             np.copyto(at_rest, now)
         mujoco.mj_rne(model, self._at_rest, 0, self._gravity)
         for at, torques, _ in self.torques.values():
-            self._driven_force[at] = torques + self._gravity[: self.n][at]
+            self.applied[at] = torques + self._gravity[: self.n][at]
 
     def _share(self, excess: Array) -> None:
         """Expect less of motors at their limit, and choose the torques of their arms' other joints.

@@ -617,7 +617,12 @@ void main() {
 #endif
     float side = max(dot(n, key_light), 0.0);
     float head = 0.12 * max(dot(n, eye), 0.0);
-    float gloss = 0.05 * pow(max(dot(n, normalize(key_light + eye)), 0.0), 24.0);
+    // The 24th power of the cosine between n and the middle of key_light and eye, without a root or a logarithm.
+    float gloss = max(dot(n, key_light + eye), 0.0);
+    gloss *= gloss / max(2.0 + 2.0 * dot(key_light, eye), 1e-6);
+    gloss *= gloss;
+    gloss *= gloss;
+    gloss *= 0.05 * gloss * gloss;
     float lit = 1.0;
 #ifdef SHADOWS
     if (side > 0.0 && all(lessThan(abs(in_light - 0.5), vec3(0.5))))

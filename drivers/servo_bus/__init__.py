@@ -1,4 +1,4 @@
-"""Drivers of arms with servos on a serial bus: Feetech (SO-101) and Dynamixel (ViperX 300 S). See docs/servo-bus.md."""
+"""Drivers of arms and leaders with servos on a bus: Feetech (SO-101), Dynamixel (ViperX). See docs/servo-bus.md."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ FEETECH = DriverSpec(
     name="feetech",
     robot="hal.drivers.servo_bus.arm:FeetechArm",
     gripper="hal.drivers.servo_bus.gripper:FeetechGripper",
+    leader="hal.drivers.servo_bus.leader:FeetechLeader",
     checks={
         "robot": "hal.drivers.servo_bus.settings:check_arm",
         "gripper": "hal.drivers.servo_bus.settings:check_gripper",
+        "leader": "hal.drivers.servo_bus.leader:check_leader",
     },
     emulated="hal.serial_line:is_emulated",
     steppable=False,
@@ -29,4 +31,5 @@ DYNAMIXEL = replace(
     name="dynamixel",
     robot="hal.drivers.servo_bus.arm:DynamixelArm",
     gripper="hal.drivers.servo_bus.gripper:DynamixelGripper",
+    leader="hal.drivers.servo_bus.leader:DynamixelLeader",
 )

@@ -141,7 +141,7 @@ class UrArm(RobotDriver):
         if fault is not None:
             link.refused = None
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
-        if link.running:
+        if link.ready:
             self.engaged = True
         elif not link.starting:
             link.start()
@@ -155,7 +155,7 @@ class UrArm(RobotDriver):
         self._find_receiver()
         if self._lost:
             raise ConnectionLost.of(self.spec.name, SILENT)
-        if not self._link.running or self._fault is not None:
+        if not self._link.ready or self._fault is not None:
             return False
         self._link.send(list(setpoint.q))
         return True
@@ -201,7 +201,7 @@ class UrArm(RobotDriver):
         None if all is well, and for the moment that it takes to find out.
         """
         link, sent = self._link, self._link.sent
-        if playing and link.running:
+        if playing and link.ready:
             off = 0.0 if sent is None else max(abs(a - b) for a, b in zip(sent, target, strict=True))
             return None if isfinite(sum(target)) and off <= self._farthest else NOT_FOLLOWING
         if self._t_ended == inf:

@@ -7,25 +7,25 @@ ports have answered. Its other calls release the lock. Its objects are never del
 from __future__ import annotations
 
 import contextlib
-import socket
-import sys
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import dashboard_client
 import rtde_control
 import rtde_receive
 
 from hal.errors import ConnectionLost, Fault
+from hal.host.library_thread import LibraryThread
 from hal.host.scheduling import note_threads
 from hal.lock import DeviceLock
+from hal.preflight import probe_ports
 
 from .faults import LOCAL, NO_CONTROLLER, NOT_STARTED, OTHER_PROGRAM, PLAYING, REGISTERS_TAKEN, STOPPED
 from .settings import UrSettings
 
-__all__ = ["WATCHDOG_HZ", "UrLink", "lock_arm", "probe"]
+__all__ = ["WATCHDOG_HZ", "UrLink", "probe"]
 
 RTDE, DASHBOARD, SCRIPTS = 30004, 29999, 30002
 WATCHDOG_HZ = 8.0
@@ -34,8 +34,8 @@ _KICK = 0.02
 """Time after which the watchdog is kicked if no set-point was sent, s."""
 _START = 0.8
 """Longest time until the control program runs, s."""
-_STALE = 1.0
-"""Time after which a request to start it is not carried out any more, s: the session that wanted it has given up."""
+_ENDING = 1.0
+"""Time for which the end of a program that was ours is tried, s."""
 _ANSWER = 3.0
 """Longest time that a caller waits for the dashboard, s."""
 _END = 0.3
@@ -50,30 +50,13 @@ _kept: list[Any] = []
 """Objects of ur_rtde, until the process ends."""
 
 
-def lock_arm(host: str) -> DeviceLock:
-    """Reserve the arm at ``host`` for this process. Raises ControlTaken."""
-    return DeviceLock(f"ur-{host}", f"the arm at {host}", patience=1.0)
+def probe(host: str) -> str:
+    """Return why a controller does not answer, naming the port; an empty text if it does."""
+    return probe_ports(host, {DASHBOARD: b"", RTDE: b"\0\5V\0\2", SCRIPTS: None})
 
 
-def probe(host: str, timeout: float = 1.0) -> str:
-    """Return why a controller does not answer, naming the port; an empty text if it does.
-
-    Its RTDE port must answer a request, and its dashboard must greet.
-    """
-    for port, request in ((DASHBOARD, b""), (RTDE, b"\0\5V\0\2"), (SCRIPTS, None)):
-        try:
-            with socket.create_connection((host, port), timeout) as line:
-                if request is not None:
-                    line.sendall(request)
-                    if not line.recv(64):
-                        return f"port {port} of {host} hangs up"
-        except OSError as error:
-            return f"port {port} of {host}: {error.strerror or error}"
-    return ""
-
-
-class UrLink:
-    """A connection. The attributes are written by one thread and read by the other.
+class UrLink(LibraryThread):
+    """A connection: ``ready`` is whether the control program runs.
 
     Args:
         name: The arm's name.
@@ -82,47 +65,35 @@ class UrLink:
         tcp: The tcp in the frame of the flange (m, rotation vector in rad); None to leave the installation's.
     """
 
+    LIBRARY: ClassVar[str] = "ur_rtde"
+    NOT_STARTED: ClassVar[Fault] = NOT_STARTED
+
     def __init__(self, name: str, settings: UrSettings, rate_hz: float, tcp: list[float] | None) -> None:
-        self.name, self.settings, self.rate_hz, self.tcp = name, settings, rate_hz, tcp
+        super().__init__(name)
+        self.settings, self.rate_hz, self.tcp = settings, rate_hz, tcp
         self.receive: Any = None
         """ur_rtde's RTDEReceiveInterface; None until open."""
-        self.running = False
-        """Whether the control program runs, and takes set-points."""
-        self.refused: Fault | None = None
-        """Why the control program was not started."""
         self.local = False
         """Whether the controller was in local control when that was last asked."""
-        self.sent: list[float] | None = None
-        """The newest set-point that was sent, rad; None before the first one of a program."""
         self.longest_gap = 0.0
         """Longest time between two messages since the program started, s."""
         self.t_late = 0.0
         """When this computer was last silent for nearly as long as the watchdog allows, s."""
         self.version, self.rate, self.has_payload = "", 0.0, False
         """Of the controller: PolyScope, cycles in a second, and whether it reports the payload."""
-        self._target: list[float] | None = None
-        self._wake = threading.Condition()
-        self._jobs: list[Callable[[], None]] = []
-        self._thread: threading.Thread | None = None
-        self._asked: float | None = None
-        """When the start that is under way was asked for, s; None for none."""
         self._ours = False
         """Whether the program that runs is ours."""
         self._end_by = 0.0
         """Until when a program that was ours is to be ended, s."""
-        self._ended = threading.Event()
-        """Ends the thread."""
-        self._lock: DeviceLock | None = None
 
     # Called by the cycle.
 
     def open(self) -> None:
         """Connect. Raises ConnectionLost and ControlTaken."""
         host = self.settings.host
-        self._lock = lock_arm(host)
-        why = probe(host)
-        if why:
-            raise ConnectionLost(f"{self.name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
+        self.reserve(DeviceLock(f"ur-{host}", f"the arm at {host}", patience=1.0))
+        if why := probe(host):
+            raise ConnectionLost.of(self.name, replace(NO_CONTROLLER, cause=why))
         with note_threads():
             self._connect(host)
 
@@ -147,30 +118,18 @@ class UrLink:
             self.receive = None
             if "registers are already in use" in str(error):
                 raise ConnectionLost.of(self.name, REGISTERS_TAKEN) from None
-            raise ConnectionLost(f"{self.name}: {error}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code) from error
+            raise ConnectionLost.of(self.name, replace(NO_CONTROLLER, cause=str(error))) from error
         _kept.extend((self._dashboard, self.receive, self._control))
         self.lose()
-        self._end_by, self._jobs, self.refused = 0.0, [], None
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, args=[self._ended], name=f"ur-{self.name}", daemon=True)
-        self._thread.start()
+        self._end_by = 0.0
+        receive, control = self.receive, self._control
+        self.begin(lambda ended: self._turn(receive, control, ended), lambda: self._disconnect(receive, control))
 
     def send(self, q: list[float]) -> None:
         """Send a set-point soon; a newer one replaces one that is waiting."""
         with self._wake:
             self._target = q
             self._wake.notify()
-
-    def start(self) -> None:
-        """Start the control program soon: then ``running`` is True, or ``refused`` says why not."""
-        asked = time.monotonic()
-        self.refused, self._asked = None, asked
-        self._call(lambda: self._start(asked))
-
-    @property
-    def starting(self) -> bool:
-        """Whether the control program is being started."""
-        return self._asked is not None
 
     def note_stopped(self) -> None:
         """Note that no program is running, or that it is paused."""
@@ -181,12 +140,12 @@ class UrLink:
         """End the control program soon: one that is left running, or resumes, still moves to its last set-point."""
         with self._wake:
             if self._ours:
-                self.running, self._ours, self._end_by = False, False, time.monotonic() + _STALE
+                self.ready, self._ours, self._end_by = False, False, time.monotonic() + _ENDING
                 self._wake.notify()
 
     def ask_remote(self) -> None:
         """Ask soon whether the controller is in local control."""
-        self._call(self._ask_remote)
+        self.call(self._ask_remote)
 
     def unlock(self) -> str:
         """Unlock a protective stop; return why that was not possible. Blocks for at most 3 s."""
@@ -201,93 +160,47 @@ class UrLink:
             except RuntimeError as error:  # the controller's own words
                 answers.append(str(error))
 
-        self._finish(unlock)
+        self.finish(unlock, _ANSWER)
         return answers[0] if answers else "the dashboard does not answer in time, and may unlock it late: keep away"
 
     def ask_local(self) -> bool | None:
         """Return whether the controller is in local control; None if it does not say. Blocks for at most 3 s."""
-        answers: list[bool] = []
-
-        def ask(given_up: threading.Event) -> None:
-            self._ask_remote()
-            answers.append(self.local)
-
-        self._finish(ask)
-        return answers[0] if answers else None
-
-    def _finish(self, job: Callable[[threading.Event], None]) -> None:
-        """Wait until the thread has done a job; ``given_up`` is set once this stops waiting."""
-        done, given_up = threading.Event(), threading.Event()
-
-        def run() -> None:
-            try:
-                if not given_up.is_set():
-                    job(given_up)
-            finally:
-                done.set()
-
-        self._call(run)
-        if not done.wait(_ANSWER):
-            given_up.set()
+        return self.local if self.finish(lambda _: self._ask_remote(), _ANSWER) else None
 
     def lose(self) -> None:
-        """Note that the controller is silent: what it does is no longer known, and its watchdog ends our program."""
-        with self._wake:
-            self.running = self._ours = False
-            self._asked = self._target = None
+        """Note that the controller is silent: its watchdog ends our program."""
+        super().lose()
+        self._ours = False
 
     def close(self) -> None:
         """End the control program, and disconnect. Idempotent."""
-        with self._wake:
-            self._ended.set()
-            self._wake.notify()
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            thread.join(4.0)
-        self.running, self.receive = False, None
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
-
-    def _call(self, job: Callable[[], None]) -> None:
-        with self._wake:
-            self._jobs.append(job)
-            self._wake.notify()
+        super().close()
+        self.receive = None
 
     # The thread.
 
-    def _run(self, ended: threading.Event) -> None:
-        receive, control = self.receive, self._control
-        last = time.monotonic()
-        while not ended.is_set():
-            with self._wake:
-                if not self._jobs and self._target is None:
-                    self._wake.wait(_KICK)
-                target, self._target = self._target, None
-                ending = time.monotonic() < self._end_by  # that comes first, and is tried again
-                jobs, self._jobs = ([], self._jobs) if ending else (self._jobs, [])
-            self._note_gap(time.monotonic() - last)
-            try:
-                if not receive.isConnected() or not control.isConnected():
-                    self.lose()
-                    self._reconnect(receive, control, ended)
-                elif ending:
-                    self._end_program()
-                elif jobs:
-                    self._reach_dashboard()
-                    for job in jobs:
-                        job()
-                elif self.running:
-                    self._serve(control, target)
-            except Exception as error:  # RuntimeError, but for answers that it cannot read
-                print(f"{self.name}: ur_rtde: {error}", file=sys.stderr)
-                self.lose()
-            last = time.monotonic()
-        with contextlib.suppress(RuntimeError):
-            self._disconnect(receive, control)
+    @property
+    def busy(self) -> bool:
+        return time.monotonic() < self._end_by  # the end of a program comes first, and is tried again
+
+    def _turn(self, receive: Any, control: Any, ended: threading.Event) -> None:
+        if not receive.isConnected() or not control.isConnected():
+            self.lose()
+            self._reconnect(receive, control, ended)
+            return
+        before = time.monotonic()
+        job, target = self.take(_KICK)
+        self._note_gap(time.monotonic() - before)
+        if job is not None:
+            self._reach_dashboard()
+            job()
+        elif self.busy:
+            self._end_program()
+        elif self.ready:
+            self._serve(control, target)
 
     def _disconnect(self, receive: Any, control: Any) -> None:
-        if time.monotonic() < self._end_by and control.isConnected():
+        if self.busy and control.isConnected():
             self._end_program()
         if self._ours and control.isConnected():
             control.stopScript()
@@ -337,21 +250,10 @@ class UrLink:
             self._control.kickWatchdog()  # without a program it only clears the register
             self._end_by = 0.0
 
-    def _start(self, asked: float) -> None:
-        if asked != self._asked:  # the connection was lost meanwhile
-            return
-        refused: Fault | None = NOT_STARTED
-        try:
-            if time.monotonic() - asked < _STALE:
-                refused = self._start_program()
-        finally:
-            with self._wake:
-                if asked == self._asked:
-                    self.running, self.refused, self._asked = refused is None, refused, None
-                elif refused is None:
-                    self._end_by = time.monotonic() + _STALE
+    def abandon(self) -> None:
+        self._end_by = time.monotonic() + _ENDING
 
-    def _start_program(self) -> Fault | None:
+    def prepare(self) -> Fault | None:
         """Start the control program with its watchdog; return why that was not possible."""
         control, load = self._control, self.settings.load
         self._ask_remote()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from hal.errors import ConnectionLost, ControlTaken
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
-from hal.preflight import CheckResult
+from hal.preflight import CheckResult, compare_payload, compare_tcp, measure_gaps
 from hal.specs import RobotSpec
 
 from .arm import find_tcp
@@ -35,14 +34,10 @@ from .faults import (
 from .link import UrLink, probe
 from .settings import UrSettings
 
-_FAR, _TURNED = 0.001, 0.005
-"""Difference of two tcps that is named, m and rad."""
 _NOMINAL, _OTHER_ARM = 5e-5, 0.015
 """Largest difference of two tcps without a calibration, and with one, m: users report up to 10 mm."""
 _PRIMARY = 30001
 """Port of the primary interface."""
-_LATE = 2.5
-"""Periods without a state from which one is late."""
 
 
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
@@ -148,28 +143,17 @@ def _check_tcp(spec: RobotSpec, settings: UrSettings, receive: Any) -> CheckResu
     theirs = Pose((x, y, z), (*axis, np.cos(angle / 2.0)))
     half_turn = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))  # from the controller's base to that of UR's models
     distance, rotation = (half_turn @ theirs).distance(Kinematics(spec.kinematics).pose(receive.getActualQ()))
-    found = f"{1e3 * distance:.1f} mm and {rotation:.3f} rad between the controller's and the model's"
-    if distance <= _FAR and rotation <= _TURNED:
-        return CheckResult("tcp", "ok", found)
     sets = settings.set_tcp and find_tcp(spec) is not None
     remedy = "the model's is set when a session opens" if sets else "set the model's in the installation"
-    remedy += "; what stays then is the factory calibration"
-    return CheckResult("tcp", "warn", found, remedy)
+    return compare_tcp(distance, rotation, f"{remedy}; what stays then is the factory calibration")
 
 
 def _check_payload(settings: UrSettings, link: UrLink) -> CheckResult:
     if not link.has_payload:
         return CheckResult("payload", "unknown", "this PolyScope does not report it", "check it in the installation")
-    mass, com = link.receive.getPayload(), link.receive.getPayloadCog()
-    found = f"{mass:.2f} kg at [{', '.join(f'{value:.3f}' for value in com)}] m in the installation"
-    load = settings.load
-    if load is None:
-        return CheckResult("payload", "ok", f"{found}; real.load is not set, so it stays")
-    if abs(load.mass - mass) < 0.01 and max(abs(a - b) for a, b in zip(load.com, com, strict=True)) < 0.002:
-        return CheckResult("payload", "ok", f"{found}, as the rig has it")
-    wanted = f"the rig has {load.mass:g} kg at {list(load.com)} m"
-    remedy = "the rig's is set when a session opens; correct the wrong one"
-    return CheckResult("payload", "warn", f"{found}; {wanted}", remedy)
+    receive, load = link.receive, settings.load
+    wanted = (load.mass, load.com) if load is not None else None
+    return compare_payload(wanted, receive.getPayload(), receive.getPayloadCog(), "the installation")
 
 
 def _check_states(spec: RobotSpec, link: UrLink, duration: float) -> CheckResult:
@@ -177,17 +161,10 @@ def _check_states(spec: RobotSpec, link: UrLink, duration: float) -> CheckResult
     if abs(link.rate - spec.rate_hz) > 1.0:
         found = f"the controller runs at {link.rate:g} Hz, the model at {spec.rate_hz:g} Hz"
         return CheckResult("states", "fail", found, f"set rate_hz: {link.rate:g} in the arm's model")
-    receive, end = link.receive, time.monotonic() + max(duration, 0.2)
-    last = receive.getTimestamp()
-    times: list[float] = []
-    while time.monotonic() < end:
-        time.sleep(2e-4)
-        if (now := receive.getTimestamp()) != last:
-            times.append(time.monotonic())
-            last = now
-    gaps = np.diff(times) if len(times) > 1 else np.array([np.inf])
-    late = int((gaps > _LATE / spec.rate_hz).sum())
-    found = f"{len(times)} states, longest gap {1e3 * gaps.max():.1f} ms, {late} late"
-    if late <= len(times) // 100:
-        return CheckResult("states", "ok", found)
-    return CheckResult("states", "warn", found, "connect the cable directly, end busy programs, use a real-time kernel")
+    seen: list[float] = [0.0]
+
+    def receive() -> int:
+        seen.append(link.receive.getTimestamp())
+        return int(seen.pop(0) != seen[0])
+
+    return measure_gaps("states", receive, 1.0 / spec.rate_hz, duration)

@@ -20,7 +20,6 @@ from hal.geometry import Pose, matrix_to_quaternion
 from hal.host.memory import SeriesBox
 from hal.host.records import GripperMail, RobotMail
 from hal.kinematics.urdf import UrdfJoint, UrdfModel, read_urdf
-from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import BodySpec, RobotSpec, WorkspaceSpec, WorldSpec
 from hal.types import RobotState, Trip
 
@@ -100,12 +99,6 @@ class ArmView:
         else:
             w, x, y, z = event.target.wxyz.tolist()
             self.drag.move(page, event.target.position.tolist(), (x, y, z, w), time.monotonic())
-
-    @property
-    def deadman_held(self) -> bool:
-        """Whether the arm's dead-man is held, by a pad that is alive."""
-        deadman = self.mail.get_deadman()
-        return deadman is not None and deadman.held and time.monotonic() - deadman.t_alive < PAD_SILENCE
 
     def read_state(self) -> None:
         """Read the newest state, and end the goal where it is reached, unused, or older than a trip."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import secrets
+import tempfile
 import threading
 import time
 from collections import deque
@@ -40,7 +40,7 @@ class _ReportedGoal(NamedTuple):
 
 
 class ViserViewer(Viewer3D):
-    """A page on this machine, at :attr:`link`. Closing it in the browser only ends its goals.
+    """Serves the view at :attr:`address` in a folder of this user. Closing its page only ends the page's goals.
 
     One thread talks to the process, so only ``wait_ready`` and ``close`` ever wait for it.
     """
@@ -64,25 +64,23 @@ class ViserViewer(Viewer3D):
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
-        self._secret = secrets.token_urlsafe(16)
-        self._address = ""
+        self._folder = tempfile.TemporaryDirectory(prefix="hal-3d-", ignore_cleanup_errors=True)
         config = {
             "label": f"robot-hal: {', '.join(sorted(self._robots))}",
-            "secret": self._secret,
+            "address": self.address,
             "groups": [to_json(group.spec) for group in groups],
         }
         self._child = Child("3D viewer", "hal.drivers.viser.process:main", config, [group.memory for group in groups])
 
     def wait_ready(self) -> None:
         ready = self._child.wait_ready()
-        self._address = ready["address"]
         self.notes = tuple(f"3D view: {note}" for note in dict.fromkeys(ready["notes"]))
         self._thread = threading.Thread(target=self._exchange_messages, name="hal-viewer3d", daemon=True)
         self._thread.start()
 
     @property
-    def link(self) -> str:
-        return f"{self._address}/?token={self._secret}"
+    def address(self) -> str:
+        return f"{self._folder.name}/socket"
 
     def goal(self, robot: str) -> Pose | None:
         """See :meth:`Viewer3D.goal`. Raises DeviceNotFound for an unknown arm."""
@@ -119,10 +117,7 @@ class ViserViewer(Viewer3D):
                 message = channel.receive(_POLL)
                 if message is None:
                     continue
-                if message.get("stop"):
-                    self.rig.stop()
-                if "goals" in message:
-                    self._set_goals(message["goals"], message["t"])
+                self._set_goals(message["goals"], message["t"])
         except ConnectionLost:
             pass  # the process is gone; the arms work without it
         finally:
@@ -154,3 +149,4 @@ class ViserViewer(Viewer3D):
         if self._thread is not None:
             self._thread.join(timeout=2.0)
         self._child.close()
+        self._folder.cleanup()

@@ -85,6 +85,7 @@ class WebConsole(Console):
         self._rings = frame_rings(self._frames.buffer, self._shown)
         config = {
             "rig": _rig_message(rig, self._shown, driven_by),
+            "viewer": rig.viewer3d.address if rig.viewer3d is not None else "",
             "listen": [listen.address, listen.port],
             "port_fixed": listen.fixed,
             "token": self._token,
@@ -385,6 +386,7 @@ def _rig_message(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None)
         "sim": rig.plan.sim,
         "attended": rig.attended,
         "emulated": rig.emulated,
+        "stage": f"/3d/{secrets.token_urlsafe(_TOKEN_BYTES)}" if rig.viewer3d is not None else "",
         "drivable": driven_by is None,
         "driven_by": driven_by,
         "demo": driven_by is None and (rig.emulated or not rig.attended),

@@ -33,6 +33,7 @@ from .messages import MalformedMessage, StopRequest, encode, parse
 from .pictures import PictureCache, PictureSockets
 from .session import WebPage, WebSession, make_app_queue
 from .sockets import CONNECTIONS, ConnectionLimit, PageSocket, PageSockets
+from .stage import STAGE_POLICY, Stage
 from .telemetry import Telemetry
 
 _STATE_PERIOD = 0.05
@@ -56,7 +57,7 @@ _HEADERS = {
 }
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
-    "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "connect-src 'self' ws://{host}; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 
 PageFile = tuple[bytes, str]
@@ -84,7 +85,8 @@ class ConsoleServer:
         self._pictures = PictureSockets(auth, self._cache, self._send_watched)
         self._connections = ConnectionLimit()
         files = read_page_files() | {"keys.js": keys_module(config["keyboard"])}
-        self._app = make_app(auth, self._connections, self._live, self._pictures, files)
+        stage = Stage(config["viewer"], config["rig"]["stage"])
+        self._app = make_app(auth, self._connections, self._live, self._pictures, stage, files)
         self._parent = os.getppid()
 
     async def run(self) -> None:
@@ -281,6 +283,7 @@ def make_app(
     connections: ConnectionLimit,
     live: LiveSockets,
     pictures: PictureSockets,
+    stage: Stage,
     files: dict[str, PageFile],
 ) -> web.Application:
     """Return the application: its routes, the checks of every request, the headers of every answer."""
@@ -299,7 +302,8 @@ def make_app(
         response.headers.update(_HEADERS)
         host = request.headers.get("Host")
         if auth.is_known_host(host):
-            response.headers["Content-Security-Policy"] = _POLICY.format(host=host)
+            policy = STAGE_POLICY if request.path.startswith("/3d/") else _POLICY
+            response.headers["Content-Security-Policy"] = policy.format(host=host)
 
     async def serve_file(request: web.Request) -> web.StreamResponse:
         found = files.get(request.match_info.get("name", _INDEX))
@@ -315,6 +319,7 @@ def make_app(
     app.router.add_get("/page/{name}", serve_file)
     app.router.add_get("/live", live.handle, allow_head=False)
     app.router.add_get("/pictures", pictures.handle, allow_head=False)
+    app.router.add_get("/3d/{path:.*}", stage.handle, allow_head=False)
     return app
 
 

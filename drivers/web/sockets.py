@@ -30,7 +30,7 @@ MAX_MESSAGES = 400
 """Messages that a page may send in one second. A page that drives sends 50, and one more for each change of the pad."""
 MAX_MALFORMED = 100
 """Malformed messages that a page may send in all."""
-_MAX_PAGES = 16
+MAX_PAGES = 16
 _MAX_REFUSED = 16
 """Sockets with a wrong token that are open at the same time to report that. More of them are not opened."""
 _PING_AFTER = 10.0
@@ -260,7 +260,7 @@ class PageSockets(ABC):
             return await self._refuse(request)
         ws = await _open(request, heartbeat=_PING_AFTER)
         transport = request.transport
-        if len(self._sockets) >= _MAX_PAGES:
+        if len(self._sockets) >= MAX_PAGES:
             await _close(ws, _TOO_MANY_PAGES)
         elif transport is not None:
             sock = PageSocket(ws, transport)

@@ -21,9 +21,8 @@ from .link import PERIOD, Report, ReportLine, XArmLink
 from .settings import XArmSettings
 
 _SILENCE = 0.12
-"""Time without a report after which the connection counts as lost, s."""
-_NO_ANSWER = 0.4
-"""The same for an answer, s: a packet that the network lost is sent again after about 0.2 s."""
+"""Time without a report, or without an answer, after which the connection counts as lost, s. A packet that the network
+lost is sent again after about 0.2 s."""
 _PAUSED = 0.06
 """Time between two calls of read() from which a silence is this process's own, s."""
 _RETRY = 0.5
@@ -105,7 +104,7 @@ class XArm(RobotDriver):
         if silent and now - self._t_tried > _RETRY:
             self._t_tried = now
             self._reports.retry()
-        if silent or now - link.silent_since > _NO_ANSWER or not link.connected or self._last is None:
+        if silent or now - link.silent_since > _SILENCE or not link.connected or self._last is None:
             raise self._lose()
         self._lost = False
         self._t_ours = now if self.engaged else self._t_ours

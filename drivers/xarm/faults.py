@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hal.errors import Fault
 
-from .sdk import ControllerErrorCodeMap, ControllerWarnCodeMap
+from .sdk import ControllerErrorCodeMap, ControllerWarnCodeMap, GripperErrorCodeMap
 
 POSITION, SERVO, MANUAL = 0, 1, 2
 """Modes: position control, servo motion, joint teaching (the arm is moved by hand)."""
@@ -47,6 +47,17 @@ def describe_warning(number: int) -> str:
     return f"W{number}: {known.get('title', 'a warning that the SDK does not know')}"
 
 
+def gripper_fault(number: int) -> Fault:
+    """Return the fault of an error of the gripper, ``G`` and its number."""
+    title = GripperErrorCodeMap.get(number, GripperErrorCodeMap["other"])["en"]["title"]
+    return Fault(f"G{number}", f"{title} (error {number})", "look for what blocks the fingers; then gripper.home()")
+
+
+NO_GRIPPER = Fault(
+    "no_gripper",
+    "the gripper does not answer through the control box",
+    "check its plug at the flange, end the arm's error C19 by recover(); give the command again",
+)
 STOP = Fault(
     "STOPPED",
     "the arm was stopped, or its motors were switched off, by UFACTORY Studio or another program",

@@ -14,12 +14,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from math import inf
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from hal.errors import ConnectionLost, Fault
-from hal.host.scheduling import note_threads
+from hal.host.library_thread import LibraryThread
 from hal.lock import DeviceLock
+from hal.preflight import probe_ports
 
 from .faults import NO_CONTROLLER, NOT_STARTED, PAUSED, POSITION, SERVO, describe_warning, error_fault
 from .sdk import XArmAPI, logger, origin_logger
@@ -59,26 +61,12 @@ def lock_arm(host: str) -> DeviceLock:
     return DeviceLock(f"xarm-{host}", f"the arm at {host}", patience=1.0)
 
 
-def probe(host: str, timeout: float = 1.0) -> str:
+def probe(host: str) -> str:
     """Return why a controller does not answer, naming the port; an empty text if it does.
 
     Without it, the SDK would wait for minutes for one that only accepts connections.
     """
-    version = b"\0\1\0\2\0\1\1"  # get the version
-    for port, request in ((COMMANDS, version), (REPORTS, b"")):
-        try:
-            with socket.create_connection((host, port), timeout) as line:
-                line.sendall(request)
-                if not line.recv(64):
-                    return f"port {port} of {host} hangs up"
-        except OSError as error:
-            return f"port {port} of {host}: {error.strerror or error}"
-    return ""
-
-
-def no_controller(name: str, why: str) -> ConnectionLost:
-    """Return the error of an arm ``name`` that cannot be reached."""
-    return ConnectionLost(f"{name}: {why}; {NO_CONTROLLER.remedy}", code=NO_CONTROLLER.code)
+    return probe_ports(host, {COMMANDS: b"\0\1\0\2\0\1\1", REPORTS: b""})  # the first gets the version
 
 
 def connect(host: str, **options: Any) -> XArmAPI:
@@ -140,7 +128,8 @@ class ReportLine:
                 time.sleep(0.001)
                 reports += self.receive()
         except OSError as error:
-            raise no_controller(self._name, f"port {REPORTS}: {error.strerror or error}") from error
+            why = f"port {REPORTS}: {error.strerror or error}"
+            raise ConnectionLost.of(self._name, replace(NO_CONTROLLER, cause=why)) from error
         return reports
 
     def retry(self) -> None:
@@ -180,23 +169,19 @@ class ReportLine:
         return reports
 
 
-class XArmLink:
-    """The SDK's connection, and its thread. The attributes are written by one thread and read by the other."""
+class XArmLink(LibraryThread):
+    """The SDK's connection: ``ready`` is whether the motors were switched on and the mode was set."""
+
+    LIBRARY: ClassVar[str] = "xarm-python-sdk"
+    NOT_STARTED: ClassVar[Fault] = NOT_STARTED
 
     def __init__(self, name: str, settings: XArmSettings, joints: int) -> None:
-        self.name, self.settings, self.joints = name, settings, joints
+        super().__init__(name)
+        self.settings, self.joints = settings, joints
         self.error = self.warning = 0
         """Numbers of the controller's error and warning; 0 for none."""
         self.t_errors = 0.0
         """When the last question for errors that was answered was asked, s."""
-        self.ready = False
-        """Whether the motors were switched on and the mode was set."""
-        self.t_ready = -inf
-        """When they were, s."""
-        self.refused: Fault | None = None
-        """Why the motors were not switched on."""
-        self.sent: list[float] | None = None
-        """The newest set-point that was sent, rad; None before the first one since the motors were switched on."""
         self.silent_since = inf
         """When the first call began that the controller has not answered, s."""
         self.longest_answer = 0.0
@@ -207,33 +192,21 @@ class XArmLink:
         self._api: Any = None
         self._axis = 0
         """Number of joints of the controller's arm."""
-        self._wake = threading.Condition()
-        self._jobs: list[Callable[[], None]] = []
-        self._target: list[float] | None = None
         self._t_target = 0.0
-        self._asked: object = None
-        """Stands for the start that is under way; None for none."""
-        self._thread: threading.Thread | None = None
-        self._ended = threading.Event()
-        self._lock: DeviceLock | None = None
 
     # Called by the cycle.
 
     def open(self) -> None:
         """Connect. Raises ConnectionLost and ControlTaken."""
         host = self.settings.host
-        self._lock = lock_arm(host)
+        self.reserve(lock_arm(host))
         why = probe(host)
         if not why:
-            self._ended, self._jobs = threading.Event(), []
-            self._thread = threading.Thread(target=self._run, args=[self._ended], name=f"xarm-{self.name}", daemon=True)
-            with note_threads():
-                self._thread.start()
-                connected = self._finish(lambda: None, _CONNECT)
-            if not connected:
+            self.begin(self._turn, self._leave)
+            if not self.finish(lambda _: None, _CONNECT):
                 why = f"port {COMMANDS} of {host}: the SDK does not connect"
         if why:
-            raise no_controller(self.name, why)
+            raise ConnectionLost.of(self.name, replace(NO_CONTROLLER, cause=why))
         if self._axis != self.joints:
             raise ConnectionLost(
                 f"{self.name}: the controller at {host} has an arm with {self._axis} joints, the model has "
@@ -258,21 +231,10 @@ class XArmLink:
             self._wake.notify()
         return True
 
-    def start(self) -> None:
-        """Switch the motors on soon: then ``ready`` is True, or ``refused`` says why not."""
-        asked = self._asked = object()
-        self.ready, self.refused = False, None
-        self._call(lambda: self._start(asked))
-
-    @property
-    def starting(self) -> bool:
-        """Whether the motors are being switched on."""
-        return self._asked is not None
-
     def stop(self) -> None:
         """Stop the arm soon."""
         self.end()
-        self._call(self._stop)
+        self.call(self._stop)
 
     def end(self) -> None:
         """Send no more set-points."""
@@ -281,69 +243,44 @@ class XArmLink:
 
     def ask(self) -> None:
         """Ask for errors soon."""
-        self._call(self._ask)
+        self.call(self._ask)
 
     def clean(self) -> bool:
         """Clear error and warning; return whether the controller answered. Blocks for at most 2 s."""
         began = time.monotonic()
-        return self._finish(self._clean, _ANSWER) and self.t_errors >= began
+        return self.finish(lambda _: self._clean(), _ANSWER) and self.t_errors >= began
 
     def forgive(self, now: float) -> None:
         """Count a silence from ``now`` (s) on: this process did not run until then."""
         if self.silent_since < now:
             self.silent_since = now
 
-    def lose(self) -> None:
-        """Note that the controller is silent: what it does is no longer known."""
-        self._asked = None
-        self.end()
-
     def close(self) -> None:
         """Stop the arm if it was ours, and disconnect. Idempotent."""
-        with self._wake:
-            self._ended.set()
-            self._wake.notify()
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            thread.join(4.0)
-        self.connected, self._asked = False, None
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
-
-    def _call(self, job: Callable[[], None]) -> None:
-        with self._wake:
-            self._jobs.append(job)
-            self._wake.notify()
-
-    def _finish(self, job: Callable[[], None], timeout: float) -> bool:
-        """Wait until the thread has done a job; return whether it has. One that is given up is not begun."""
-        done, given_up = threading.Event(), threading.Event()
-
-        def run() -> None:
-            if not given_up.is_set():
-                job()
-                done.set()
-
-        self._call(run)
-        if done.wait(timeout):
-            return True
-        given_up.set()
-        return done.is_set()
+        super().close()
+        self.connected = False
 
     # The thread.
 
-    def _run(self, ended: threading.Event) -> None:
-        while not ended.is_set():
-            try:
-                if self._api is None or not self._api.connected:
-                    self._connect(ended)
-                else:
-                    self._serve()
-            except Exception as error:  # such as an answer that the SDK cannot read
-                print(f"{self.name}: xarm-python-sdk: {type(error).__name__}: {error}", file=sys.stderr)
-                self._disconnect()
-                ended.wait(_RETRY)
+    def _turn(self, ended: threading.Event) -> None:
+        """Do what waits, one call at a time: a job, or a set-point, or a question for errors."""
+        if self._api is None or not self._api.connected:
+            self._connect(ended)
+            return
+        job, target = self.take(_POLL)
+        if job is not None:
+            job()
+        elif target is not None:
+            self.sent = target
+            self._send(target)
+        elif not ended.is_set():
+            self._ask()
+
+    def fail(self, ended: threading.Event) -> None:
+        self._disconnect()
+        ended.wait(_RETRY)
+
+    def _leave(self) -> None:
         if self.ready and self.connected:
             self._stop()
         self._disconnect()
@@ -366,24 +303,6 @@ class XArmLink:
         self.lose()
         if api is not None:
             api.disconnect()
-
-    def _serve(self) -> None:
-        """Do what waits, one call at a time: a job, or a set-point, or a question for errors."""
-        job = target = None
-        with self._wake:
-            if not self._jobs and self._target is None:
-                self._wake.wait(_POLL)
-            if self._jobs:
-                job = self._jobs.pop(0)
-            elif self._target is not None:
-                target = self.sent = self._target
-                self._target = None
-        if job is not None:
-            job()
-        elif target is not None:
-            self._send(target)
-        elif not self._ended.is_set():
-            self._ask()
 
     def _timed(self, call: Callable[..., Any], *args: Any) -> Any:
         """Make a call that the controller answers at once."""
@@ -411,19 +330,7 @@ class XArmLink:
             if self.warning not in (0, before):
                 print(f"{self.name}: warning of the controller: {describe_warning(self.warning)}", file=sys.stderr)
 
-    def _start(self, asked: object) -> None:
-        if asked is not self._asked:  # the connection was lost meanwhile
-            return
-        refused: Fault | None = NOT_STARTED
-        try:
-            refused = self._start_motors()
-        finally:
-            with self._wake:
-                if asked is self._asked:
-                    self.ready, self.t_ready = refused is None, time.monotonic()
-                    self.refused, self._asked = refused, None
-
-    def _start_motors(self) -> Fault | None:
+    def prepare(self) -> Fault | None:
         """Switch the motors on and set servo mode; return why that was not possible."""
         api, load = self._api, self.settings.load
         self._ask()

@@ -9,12 +9,10 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-
 from hal.errors import ControlTaken, Fault
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
-from hal.preflight import CheckResult
+from hal.preflight import CheckResult, compare_payload, compare_tcp, measure_gaps
 from hal.specs import RobotSpec
 
 from .faults import NO_CONTROLLER, describe_warning, error_fault, find_occupant
@@ -22,12 +20,8 @@ from .link import PERIOD, Report, ReportLine, connect, lock_arm, probe
 from .sdk import XCONF
 from .settings import XArmSettings
 
-_FAR, _TURNED = 0.001, 0.005
-"""Difference of two tcps that is named, m and rad."""
 _NARROWER = 1e-3
 """By how much a limit of the model may be beyond the controller's, rad."""
-_LATE = 2.5
-"""Periods without a report from which one is late."""
 _FIRST = 1.0
 """Longest time until the first of the reports with errors and payload comes, s."""
 
@@ -59,8 +53,9 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         yield from _check_state(api, report)
         yield check_limits(spec, api.axis, api.device_type, api.sn)
         yield _check_tcp(spec, report)
-        yield _check_payload(settings, api)
-        yield _check_reports(line, duration)
+        wanted = (settings.load.mass, settings.load.com) if settings.load is not None else None
+        yield compare_payload(wanted, api.tcp_load[0], [1e-3 * x for x in api.tcp_load[1]], "the controller")
+        yield measure_gaps("reports", lambda: len(line.receive()), PERIOD, duration)
     except ControlTaken as error:
         yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
     except OSError as error:
@@ -114,36 +109,5 @@ def _check_tcp(spec: RobotSpec, report: Report) -> CheckResult:
     position, (roll, pitch, yaw) = [1e-3 * x for x in report.pose[:3]], report.pose[3:]
     theirs = Pose.from_rpy(position, (roll, pitch, yaw))
     distance, turn = theirs.distance(Kinematics(spec.kinematics).pose(report.q[: len(spec.joints)]))
-    found = f"{1e3 * distance:.1f} mm and {turn:.3f} rad between the controller's and the model's"
-    if distance <= _FAR and turn <= _TURNED:
-        return CheckResult("tcp", "ok", found)
     remedy = "set the model's in UFACTORY Studio: the controller's own limits of speed and space are for its tcp"
-    return CheckResult("tcp", "warn", found, remedy)
-
-
-def _check_payload(settings: XArmSettings, api: Any) -> CheckResult:
-    mass, com = api.tcp_load[0], [1e-3 * x for x in api.tcp_load[1]]
-    found = f"{mass:.2f} kg at [{', '.join(f'{value:.3f}' for value in com)}] m in the controller"
-    load = settings.load
-    if load is None:
-        return CheckResult("payload", "ok", f"{found}; real.load is not set, so it stays")
-    if abs(load.mass - mass) < 0.01 and max(abs(a - b) for a, b in zip(load.com, com, strict=True)) < 0.002:
-        return CheckResult("payload", "ok", f"{found}, as the rig has it")
-    wanted = f"the rig has {load.mass:g} kg at {list(load.com)} m"
-    return CheckResult("payload", "warn", f"{found}; {wanted}", "the rig's is set when a session opens")
-
-
-def _check_reports(line: ReportLine, duration: float) -> CheckResult:
-    """Measure when reports come."""
-    end = time.monotonic() + max(duration, 0.2)
-    times: list[float] = []
-    line.receive()
-    while time.monotonic() < end:
-        time.sleep(2e-4)
-        times += [time.monotonic()] * len(line.receive())
-    gaps = np.diff(times) if len(times) > 1 else np.array([np.inf])
-    late = int((gaps > _LATE * PERIOD).sum())
-    found = f"{len(times)} reports, longest gap {1e3 * gaps.max():.1f} ms, {late} late"
-    if late <= len(times) // 100:
-        return CheckResult("reports", "ok", found)
-    return CheckResult("reports", "warn", found, "connect the cable directly, end busy programs")
+    return compare_tcp(distance, turn, remedy)

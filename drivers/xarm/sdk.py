@@ -6,9 +6,17 @@ import contextlib
 import io
 
 with contextlib.redirect_stdout(io.StringIO()):
-    from xarm.core.config.x_code import ControllerErrorCodeMap, ControllerWarnCodeMap
+    from xarm.core.config.x_code import ControllerErrorCodeMap, ControllerWarnCodeMap, GripperErrorCodeMap
     from xarm.core.config.x_config import XCONF
     from xarm.core.utils.log import logger, origin_logger
     from xarm.wrapper import XArmAPI
 
-__all__ = ["XCONF", "ControllerErrorCodeMap", "ControllerWarnCodeMap", "XArmAPI", "logger", "origin_logger"]
+__all__ = [
+    "XCONF",
+    "ControllerErrorCodeMap",
+    "ControllerWarnCodeMap",
+    "GripperErrorCodeMap",
+    "XArmAPI",
+    "logger",
+    "origin_logger",
+]

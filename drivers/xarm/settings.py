@@ -7,7 +7,7 @@ from math import pi
 
 from hal.config.files import DeviceSettings
 from hal.config.schema import Host, Load
-from hal.specs import RobotSpec
+from hal.specs import GripperSpec, RobotSpec
 
 TOP_SPEED, TOP_TCP_SPEED = pi, 1.0
 """Limits of servo mode, rad/s and m/s: 180 degrees/s and 1000 mm/s (UFACTORY's servo mode guide)."""
@@ -21,6 +21,18 @@ class XArmSettings(DeviceSettings):
     host: Host
     load: Load | None = None
     """Payload, set when a session opens; None: that of the controller."""
+
+
+class XArmGripperSettings(DeviceSettings):
+    """Settings under ``real:`` of an xArm Gripper."""
+
+    host: Host
+    """The control box; the arm's, unless it is given."""
+
+
+def check_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in a gripper's record: key in the gripper's entry of the rig file, message and code."""
+    yield from XArmGripperSettings.check(spec)[1]
 
 
 def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:

@@ -61,6 +61,8 @@ class Context:
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
     gripper_files: dict[str, Path] = field(default_factory=dict)
     """Files of the grippers that are not part of their arm's model, by the keys of the arms in the rig."""
+    served: dict[str, dict[str, RobotSpec]] = field(default_factory=dict)
+    """Arms at other computers, by their address and name; those that were asked."""
 
     @property
     def rig_sim(self) -> bool:
@@ -101,6 +103,10 @@ class Context:
             if owner is not None and owner.sim is not None:
                 return owner.sim
         return self.rig_sim
+
+    def is_served(self, config: RobotConfig) -> bool:
+        """Return whether an arm is at another computer, and is not simulated here in its place."""
+        return config.at is not None and self.sim is not True and self.driver is None and config.sim is not True
 
     def read_model(
         self, kind: type[Model], key: str, config: RobotConfig | CameraConfig, folder: str, *parts: str

@@ -489,7 +489,7 @@ _CODES = {
 # Overrides: ``KEY=VALUE`` sets any key of a rig from outside its file.
 
 SET = "--set"
-SECTIONS = {"robots": "robot", "cameras": "camera", "gamepads": "gamepad"}
+SECTIONS = {"robots": "robot", "cameras": "camera", "leaders": "leader", "gamepads": "gamepad"}
 
 
 def apply_overrides(

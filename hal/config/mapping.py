@@ -110,6 +110,8 @@ class TeleopMapping(Strict):
     """Button that moves the arm to its home position while the dead-man is held."""
     other_arm: ButtonName | None = None
     """Button that hands the pad on to the next arm of a session with several, while the dead-man is released."""
+    take_over: ButtonName | None = None
+    """Button with which a leader drives in place of a policy; it may be one of :attr:`actions`."""
     actions: dict[str, ButtonName] = Field(default_factory=dict)
     """Action of an app -> its button, for example ``record: south``; each app documents its actions."""
 

@@ -443,6 +443,40 @@ class CompleteStream(NamedTuple):
         return None
 
 
+LeverUse = Literal["gripper", "deadman", "none"]
+"""What the lever of a leader is."""
+_GAINS = Several(Quantity("", 0.0, 10.0, above=True), None, "one for each joint")
+_SIGNS = Several(Quantity("", -1.0, 1.0), None, "one for each joint")
+
+
+class LeaderJoints(Strict):
+    """From the motors of a leader to the joints of an arm: position = sign * scale * (angle - offset)."""
+
+    signs: Annotated[tuple[float, ...], _SIGNS] | None = None
+    """Direction of each joint, 1 or -1; in a rig instead of the model's, as the keys below."""
+    scales: Annotated[tuple[float, ...], _GAINS] | None = None
+    """Angle of each joint for a rad of its motor."""
+    offsets: JointPositions | None = None
+    """Angle of each motor where the joint is at zero, rad."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Options of the driver."""
+
+
+class LeaderModel(LeaderJoints):
+    """A leader arm."""
+
+    title: str
+    driver: str
+    joints: tuple[str, ...]
+    leads: tuple[str, ...]
+    """Models of arms that it leads joint to joint; it leads any other one by poses."""
+    arm: str | None = None
+    """Model in ``robots/`` with its kinematics, to lead other arms by poses."""
+    lever: LeverUse = "none"
+    middles: JointPositions | None = None
+    """Usual position of each joint, rad: the turn of a motor that counts turns is chosen around it."""
+
+
 # Files
 
 

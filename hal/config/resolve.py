@@ -26,9 +26,10 @@ from .files import find_file, read_yaml, suggest
 from .models import load_pad_models
 from .objects import load_objects
 from .resolve_cameras import resolve_camera
+from .resolve_leaders import resolve_leader
 from .resolve_randomize import resolve_randomize
 from .resolve_robots import resolve_robot
-from .rigfile import Device, PadConfig
+from .rigfile import Device, PadConfig, RobotConfig
 from .schema import Unknown
 
 CHOSEN_LATER = "auto"
@@ -44,7 +45,7 @@ def resolve(context: Context) -> Plan:
     _check_names(context)
     robots = _resolve_all(context, "robots", resolve_robot)
     cameras = _resolve_all(context, "cameras", resolve_camera)
-    pads = _resolve_all(context, "gamepads", resolve_pad)
+    pads = _resolve_all(context, "leaders", resolve_leader) + _resolve_all(context, "gamepads", resolve_pad)
     with suppress(Unknown):
         _check_clock(context)
     _check_rates(context, robots)
@@ -69,7 +70,8 @@ def resolve(context: Context) -> Plan:
     physics = rig.simulation
     world: WorldSpec | None = None
     if driver is not None:
-        scene = bodies, robots, physics.shadows, randomize
+        here = tuple(robot for robot in robots if robot.at is None)
+        scene = bodies, here, physics.shadows, randomize
         world = WorldSpec(driver, physics.physics_hz, physics.gravity, *scene)
     return Plan(
         sim=context.rig_sim,
@@ -237,7 +239,7 @@ def _resolve_all(
 
 def _check_names(context: Context) -> None:
     taken: dict[str, str] = {}
-    for section in ("robots", "cameras", "gamepads"):
+    for section in ("robots", "cameras", "leaders", "gamepads"):
         for name in getattr(context.rig, section, ()):
             key = f"{section}.{name}"
             if name in taken:
@@ -254,6 +256,11 @@ def _check_clock(context: Context) -> None:
         for name, config in devices.items():
             with suppress(Unknown):
                 key = f"{section}.{name}"
+                if isinstance(config, RobotConfig) and context.is_served(config):
+                    context.report(
+                        key, "is at another computer: use the clock real_time, or --sim", "real_in_lock_step"
+                    )
+                    continue
                 if context.is_simulated(config):
                     continue
                 if key in context.real_time_only:

@@ -64,6 +64,14 @@ class _Body(NamedTuple):
 def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec | None:
     """Return the record of an arm; None, with the problems added, if there are any."""
     key = f"robots.{name}"
+    with suppress(Unknown):
+        if context.is_served(config):
+            return _find_served(context, key, name, str(config.at))
+        if config.at is not None and not config.model:
+            context.report(
+                f"{key}.model", f"is missing: the model of what is at {config.at}, to simulate", "missing_key"
+            )
+            return None
     model, file = context.read_model(RobotModel, key, config, "robots")
     simulated = True
     with suppress(Unknown):
@@ -85,6 +93,25 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
             check_robot_spec(context, key, spec, config, model, file)
             return spec
     return None
+
+
+def _find_served(context: Context, key: str, name: str, at: str) -> RobotSpec | None:
+    """Return the record of an arm at another computer; None, with the problem added, if that has no such arm.
+
+    Raises:
+        ConnectionLost: Nothing answers there.
+        HalError: The other computer's refusal.
+    """
+    from ..remote.client import fetch_robots
+
+    if at not in context.served:
+        context.served[at] = fetch_robots(at)
+    there = context.served[at]
+    if name not in there:
+        context.report(key, f"the rig at {at} has no robot {name!r}; it has: {', '.join(there)}", "unknown_robot")
+        return None
+    context.urdfs[name] = read_urdf(Path(there[name].urdf), meshes=False)
+    return there[name]
 
 
 def _make_spec(

@@ -24,17 +24,30 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core import PydanticKnownError
 from pydantic_core.core_schema import ModelSchema
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..registry import explain_engine
 from ..specs import ViewSpec
 from ..types import STREAMS
-from .models import Capture, Depth, Distortion, Drivers, FieldOfView, LimitsModel, TcpModel, expand_names
+from .models import (
+    Capture,
+    Depth,
+    Distortion,
+    Drivers,
+    FieldOfView,
+    LeaderJoints,
+    LeverUse,
+    LimitsModel,
+    TcpModel,
+    expand_names,
+)
 from .randomize import RandomizeConfig
 from .schema import (
+    Address,
     CameraRate,
     Coordinate,
     Degrees,
@@ -238,7 +251,10 @@ def _expand_gripper(value: Any) -> Any:
 class RobotConfig(Device):
     """An arm."""
 
-    model: str
+    at: Address | None = None
+    """The computer that serves this arm (``hal serve``), ``NAME`` or ``NAME:PORT``. Its rig has an arm of this name,
+    with all settings; the other keys of this entry are for ``--sim``."""
+    model: Annotated[str, Field(validate_default=True)] = ""
     """A name in ``robots/``, or the path of a file of your own."""
     arm: Name | None = None
     """Which arm, where the model has several (``left`` or ``right`` of a ``baxter``)."""
@@ -263,6 +279,13 @@ class RobotConfig(Device):
     workspace: WorkspaceConfig | None = None
     payload: PayloadConfig | None = None
     """For real arms whose driver holds their weight. Others have settings of their own, such as ``real.load``."""
+
+    @field_validator("model")
+    @classmethod
+    def _check_model(cls, model: str, info: ValidationInfo) -> str:
+        if not model and info.data.get("at") is None:
+            raise PydanticKnownError("missing")
+        return model
 
 
 class Output(Strict):
@@ -370,6 +393,30 @@ class PadConfig(Strict):
     """Options of the driver."""
 
 
+class LeaderConfig(LeaderJoints):
+    """A leader arm, which a person moves and an arm of the rig follows."""
+
+    model: str
+    """A name in ``sensors/leaders/``, or the path of a file of your own."""
+    sim: Flag = False
+    """``true``: simulated, moved by the program. The rig's flag is for robots and cameras, as with gamepads."""
+    driver: str | None = None
+    """A driver instead of the model's."""
+    port: str | None = None
+    """Serial device of its motors, best ``/dev/serial/by-id/...``."""
+    drives: str | None = None
+    """Arm that it leads where several arms are driven at once; default: the first that no other one drives."""
+    deadman: str | None = None
+    """Gamepad or pedal of the rig that must be held; default: the lever if it is the dead-man, else the first one."""
+    lever: LeverUse | None = None
+    """What its lever is instead of what the model says: ``gripper``, ``deadman`` or ``none``."""
+    engage: Literal["clutch", "approach"] = "clutch"
+    """``clutch``: the arm follows what the leader moves from engaging on. ``approach``: it also comes to the leader's
+    own position, at the arm's ``move_speed``."""
+    pose_scale: Annotated[float, Quantity("", 0.0, 10.0, above=True)] = 1.0
+    """Way of the arm's tcp for each m of the leader's, if it leads by poses."""
+
+
 def _check_engine(name: str) -> str:
     if message := explain_engine(name):
         raise ValueProblem(message, "invalid_choice")
@@ -460,6 +507,7 @@ class RigFile(Strict):
     """Whether every device without a flag of its own is simulated."""
     robots: Annotated[dict[Name, RobotConfig], BeforeValidator(_fill_section), _FEW] = Field(default_factory=dict)
     cameras: Annotated[dict[Name, CameraConfig], BeforeValidator(_fill_section), _FEW] = Field(default_factory=dict)
+    leaders: Annotated[dict[Name, LeaderConfig], BeforeValidator(_fill_section), _FEW] = Field(default_factory=dict)
     gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_fill_section), _FEW] = Field(default_factory=dict)
     objects: Annotated[list[Any], BeforeValidator(_check_objects)] = Field(default_factory=list, max_length=OBJECTS)
     """Objects of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""

@@ -230,6 +230,8 @@ def is_own_host(options: Mapping[str, Any]) -> bool:
 Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(pattern=r"^_?[A-Za-z][A-Za-z0-9_-]*$")]
 Host = Annotated[str, BeforeValidator(_host)]
+Address = Annotated[str, Field(pattern=r"^([A-Za-z0-9._-]+|\[[0-9a-fA-F:.]+\])(:[0-9]{1,5})?$")]
+"""A computer's name or address, with or without a port."""
 Pixels = Annotated[int, Field(strict=True, gt=0, le=16384)]
 
 # Every number of a rig, a model, an object or a mapping is one of these. The ranges include everything that fits on one

@@ -159,8 +159,8 @@ class ArmUnit:
             return
         ahead = self.servo.answer(now, self.reading)
         self._answered = ahead is not None
-        self._note_reanchored()
         if ahead is not None:  # the device waits for it
+            self._note_reanchored()
             self._pass_on(ahead, now)
         self._setpoint = self.servo.tick(now, self.reading, self._inbox(app, said), late)
         self._note_reanchored()

@@ -9,7 +9,7 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,16 +30,17 @@ GRIPPER_HZ = 100.0
 def make_groups(plan: Plan) -> list[GroupSpec]:
     """Return the groups of a rig: the devices of its simulated world together, and each other arm alone.
 
-    Arms with the same :attr:`.RobotSpec.group` are one group. A gripper is in the group of its arm, except for one
-    whose driver needs a process of its own. In lock-step the first group runs in the caller's process, and the others,
-    if there are any, keep in step with it.
+    Arms with the same :attr:`.RobotSpec.group` are one group, and so are those at one other computer. A gripper is in
+    the group of its arm, except for one whose driver needs a process of its own. In lock-step the first group runs in
+    the caller's process, and the others, if there are any, keep in step with it.
     """
     world, clock, collisions = plan.world, plan.clock, plan.collisions
-    inside = tuple(r for r in plan.robots if world is not None and r.driver == world.driver)
-    outside = tuple(r for r in plan.robots if r not in inside)
+    here = tuple(r for r in plan.robots if r.at is None)
+    inside = tuple(r for r in here if world is not None and r.driver == world.driver)
+    outside = tuple(r for r in here if r not in inside)
     apart = [
         GroupSpec(f"{r.name}.gripper", clock, GRIPPER_HZ, (), grippers=(r.gripper,))
-        for r in plan.robots
+        for r in here
         if r.gripper is not None and _is_apart(r.gripper)
     ]
     shared: dict[str, list[RobotSpec]] = {}
@@ -60,7 +61,25 @@ def make_groups(plan: Plan) -> list[GroupSpec]:
     groups = []
     if world is not None:
         groups = [GroupSpec("simulation", clock, world.physics_hz, inside, world, _grippers(inside), collisions)]
-    return _add_neighbours(groups + alone + apart)
+    return _add_neighbours(groups + alone + apart) + _make_remote_groups(plan)
+
+
+def _make_remote_groups(plan: Plan) -> list[GroupSpec]:
+    """Return a group for each computer that serves arms of this rig, with their grippers."""
+    served: dict[str, list[RobotSpec]] = {}
+    for robot in plan.robots:
+        if robot.at is not None:
+            served.setdefault(robot.at, []).append(robot)
+    return [
+        GroupSpec(
+            name=at,
+            clock=plan.clock,
+            rate_hz=min(robot.rate_hz for robot in arms),
+            robots=tuple(arms),
+            grippers=tuple(robot.gripper for robot in arms if robot.gripper is not None),
+        )
+        for at, arms in served.items()
+    ]
 
 
 def _add_neighbours(groups: Sequence[GroupSpec]) -> list[GroupSpec]:
@@ -248,6 +267,7 @@ class RemoteHost(Host):
         shared: SharedMemory | None = None,
         others: Sequence[tuple[GroupSpec, SharedMemory]] = (),
         latch: StopLatch | None = None,
+        beating: bool = True,
     ) -> None:
         """Start the process.
 
@@ -258,6 +278,8 @@ class RemoteHost(Host):
             others: Groups whose arms have copies in this one's world, must not be touched, or have this one's gripper,
                 with their memories.
             latch: The rig's latched stop.
+            beating: Whether this process is the program that uses the group. Otherwise it writes the heartbeat of the
+                one that does, from elsewhere.
         """
         super().__init__(latch)
         self.spec = spec
@@ -268,15 +290,17 @@ class RemoteHost(Host):
         config = {"group": to_json(spec), "snapshot_capacity": SNAPSHOT_CAPACITY, "realtime": realtime}
         config["others"] = [to_json(other) for other, _ in others]
         memories = [self.shared, *(memory for _, memory in others)]
-        self.child = Child(spec.name, "hal.host.main:main", config, memories)
+        target = "hal.host.main:main" if spec.at is None else "hal.remote.client:main"
+        self.child = Child(spec.name, target, config, memories)
         self._close_by: float | None = None
         """Time at which the process is killed, s; None before it was asked to close."""
         self._asking = threading.Lock()
         self._writing = threading.RLock()  # a signal handler may stop the rig in the middle of a beat
         self._closed = threading.Event()
-        self.beat()
         self._thread = threading.Thread(target=self._heartbeat, name=f"hal-heartbeat-{spec.name}", daemon=True)
-        self._thread.start()
+        if beating:
+            self.beat()
+            self._thread.start()
 
     @staticmethod
     def allocate(spec: GroupSpec) -> SharedMemory:
@@ -342,8 +366,25 @@ class RemoteHost(Host):
         assert self._close_by is not None
         self.child.close(timeout=max(0.0, self._close_by - time.monotonic()))
         self._closed.set()
-        self._thread.join(timeout=1.0)
+        if self._thread.ident is not None:
+            self._thread.join(timeout=1.0)
         self.shared.close()
+
+
+def start_processes(
+    groups: Sequence[GroupSpec], realtime: bool, latch: StopLatch | None = None, beating: bool = True
+) -> Iterator[RemoteHost]:
+    """Start the process of each group in real time, and yield its host at once, so that the caller can close it.
+
+    That of the simulated world is started last, because it mirrors the arms of the others. The arguments are those of
+    :class:`RemoteHost`.
+    """
+    memories = [(group, RemoteHost.allocate(group)) for group in groups]
+    for group, shared in sorted(memories, key=lambda pair: pair[0].world is not None):
+        seen = group.world is not None or bool(group.neighbours) or not group.robots
+        others = [pair for pair in memories if seen and pair[0] is not group and pair[0].at is None]
+        urgent = realtime and bool(group.robots)
+        yield RemoteHost(group, realtime=urgent, shared=shared, others=others, latch=latch, beating=beating)
 
 
 class SteppedHost(RemoteHost):

@@ -89,6 +89,16 @@ class Mailbox(_Slots):
         self._layout.pack_into(self._payloads[(self._seq + 1) & self._mask], 0, *values)
         return self._announce(self._layout.size)
 
+    @property
+    def record_size(self) -> int:
+        """Number of bytes of a record."""
+        return self._layout.size
+
+    def write_bytes(self, record: bytes | bytearray) -> int:
+        """Announce a record of :attr:`record_size` bytes, packed elsewhere, and return its number."""
+        self._payloads[(self._seq + 1) & self._mask][:] = record
+        return self._announce(len(record))
+
     def read(self) -> tuple[int, tuple[Any, ...]] | None:
         """Return the newest whole record as (number, values); None before the first one.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+from array import array
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from math import isnan, nan
@@ -55,6 +56,7 @@ def read_fault(record: bytes, offset: int) -> Fault | None:
 
 _STAMP = struct.Struct("<ddQ")
 _SERVO = struct.Struct("<iiiQQ?Qddiid?iQQ?")
+_T_WRITTEN = struct.calcsize("<iiiQQ?Q")
 _CONTROLLERS = {int(mode): mode for mode in ControlMode}
 _STATUSES = {int(status): status for status in RobotStatus}
 _TRIPS = {int(trip): trip for trip in Trip}
@@ -111,6 +113,8 @@ class StateLayout:
         self._set_at = _STAMP.size + 8 * 3 * n
         self._set_points = struct.Struct(f"<{2 * n}d")
         self._nothing = (nan,) * n
+        self.times = (0, self._servo_at + _T_WRITTEN, self._servo_at + _T_WRITTEN + 8)
+        """Places of the times in a record: of the state, of the set-point and of the last braking."""
 
     @property
     def format(self) -> str:
@@ -371,6 +375,8 @@ class RobotMail:
         """Returns only the servo's part of the newest state: for every ``send``."""
         self.history = History(state, self._layout.state)
         """The last :data:`STATES` states."""
+        self.state_times = self._layout.times
+        """Where in a state there are times."""
         self._newest_session = make_reader(self.session, SessionRecord._make)
 
     @staticmethod
@@ -390,7 +396,7 @@ class RobotMail:
         """Send a command. A chunk is written to a box of its own first: most commands are short, and frequent."""
         width = max(2 * self.n, 7)
         if record.kind is Kind.JOINT_CHUNK:
-            self._chunk.write(record.t, record.seq, record.values)
+            self.put_chunk(record.seq, record.values)
             record = record._replace(values=())
         values = tuple(record.values) + (0.0,) * (width - len(record.values))
         self.command.write(
@@ -403,6 +409,15 @@ class RobotMail:
             len(record.values),
             *values,
         )
+
+    def put_chunk(self, number: int, values: Sequence[float]) -> None:
+        """Write the numbers of the chunk whose command has this number, and comes next."""
+        self._chunk.write(0.0, number, values)
+
+    def read_chunk(self) -> tuple[int, array[float]] | None:
+        """Return the newest chunk as (number of its command, values); None before the first one."""
+        chunk = self._chunk.read()
+        return None if chunk is None else chunk[2:]
 
     def put_deadman(self, record: DeadmanRecord) -> None:
         """Publish the state of the dead-man."""
@@ -420,9 +435,9 @@ class RobotMail:
         seq, t, deadline, kind, t_event, session, count, *rest = values
         numbers = tuple(rest[:count])
         if kind == Kind.JOINT_CHUNK:
-            chunk = self._chunk.read()
+            chunk = self.read_chunk()
             # Another number: overtaken by the next chunk, whose command comes in a moment.
-            numbers = tuple(chunk[3]) if chunk is not None and chunk[2] == seq else ()
+            numbers = tuple(chunk[1]) if chunk is not None and chunk[0] == seq else ()
         return CommandRecord(seq, session, t, deadline, Kind(kind), numbers, t_event)
 
     # From the servo to the app.

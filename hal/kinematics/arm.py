@@ -233,10 +233,12 @@ class Kinematics:
     def _pull(self, q: Sequence[float] | Array, gain: float) -> Array | None:
         """Return the speeds (n,) towards home, rad/s; None if they are all 0."""
         way: Array = self.home - q
-        farthest = max(map(abs, way.tolist()))
-        if farthest == 0.0:
+        square = float(way.dot(way))
+        if square == 0.0:
             return None
-        way *= min(gain, POSTURE_SPEED / farthest)
+        if gain * gain * square > POSTURE_SPEED * POSTURE_SPEED:  # else none is too fast: all of them together are not
+            gain = min(gain, POSTURE_SPEED / max(map(abs, way.tolist())))
+        way *= gain
         return way
 
     def _is_near_singular(self, q: Sequence[float] | Array, gram: Array) -> bool:

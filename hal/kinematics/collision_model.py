@@ -81,7 +81,9 @@ class CollisionModel:
         scene = _scene(tuple(arms), spec)
         self._scene = scene
         self._data: Any = scene.model.createData()
+        self._geometry: Any = scene.geometry
         self._geometry_data: Any = pin.GeometryData(scene.geometry)
+        self._compute_distance: Any = pin.computeDistance
         self._q: Array = np.zeros(scene.model.nq)
         self.n = len(scene.columns)
         """Number of joints of all arms."""
@@ -107,8 +109,8 @@ class CollisionModel:
 
     def distance(self, pair: int) -> float:
         """Return the distance (m) of a pair where the arms were placed last; negative if the shapes overlap."""
-        found = self._pin.computeDistance(self._scene.geometry, self._geometry_data, pair)
-        return float(found.min_distance)
+        distance: float = self._compute_distance(self._geometry, self._geometry_data, pair).min_distance
+        return distance
 
     def distances(self) -> Array:
         """Return the distances (pairs,) of all pairs where the arms were placed last, m."""
@@ -144,11 +146,15 @@ class PairBounds:
         self.distances: Array = np.full(model.count, -np.inf)
         """Distances (pairs,), m, at the positions where each was computed last: of the pairs that :meth:`near` returns,
         those at its ``q``."""
+        self.shares: Array = np.full((model.n, model.count), np.inf)
+        """(n, pairs), 1/rad: no pair gets under the ``least`` of the last call of :meth:`near` as long as the turns of
+        the joints since the positions of that call, times its column, make less than 1 together."""
         self.weights: Array = np.full(model.n, np.inf)
-        """(n,), 1/rad: no pair gets under the ``least`` of the last call of :meth:`near` as long as the turns of the
-        joints since the positions of that call, times these, make less than 1 together."""
-        self._at: Array = np.zeros((model.count, model.n))
-        """Joint positions (pairs, n) at which each distance was computed, rad."""
+        """The greatest share of each joint (n,), 1/rad: as good as the column of any pair."""
+        # Pairs are along the last axis, where numpy is fast.
+        self._at: Array = np.zeros((model.n, model.count))
+        """Joint positions (n, pairs) at which each distance was computed, rad."""
+        self._levers: Array = np.ascontiguousarray(model.levers.T)
         self._reserve: Array = _RESERVE * model.levers.sum(axis=1)
 
     def near(self, q: Array, way: Array, least: Array) -> list[int]:
@@ -159,21 +165,23 @@ class PairBounds:
             way: How far each joint may move from there at most (n,), rad.
             least: Distance of each pair, m.
         """
-        levers = self.model.levers
-        bounds = self.distances - np.einsum("kj,kj->k", levers, np.abs(self._at - q))
-        reach = levers @ way
+        levers, distances = self._levers, self.distances
+        bounds = distances - (levers * np.abs(self._at - q[:, np.newaxis])).sum(axis=0)
+        reach = way.dot(levers)
         needed = reach + least
-        # Pairs within thrice the way are computed before they are needed, or the weights would soon be of no use.
-        fresh = least + _FRESH * (self.distances - least)
-        low = np.flatnonzero(bounds < np.maximum(needed, np.minimum(needed + 2.0 * reach + self._reserve, fresh)))
+        # Pairs within thrice the way are computed before they are needed, or the shares would soon be of no use.
+        fresh = least + _FRESH * (distances - least)
+        low = (bounds < np.maximum(needed, np.minimum(needed + 2.0 * reach + self._reserve, fresh))).nonzero()[0]
         if len(low):
             self._compute(q, low, bounds)
         rooms = bounds - least
         if rooms.min(initial=np.inf) > 0.0:
-            self.weights = (levers / rooms[:, np.newaxis]).max(axis=0, initial=0.0)
+            self.shares = levers / rooms
+            self.weights = self.shares.max(axis=1, initial=0.0)
         else:
-            self.weights = np.full(self.model.n, np.inf)
-        near: list[int] = np.flatnonzero(bounds < needed).tolist()
+            self.shares = np.full(levers.shape, np.inf)
+            self.weights = np.full(len(levers), np.inf)
+        near: list[int] = (bounds < needed).nonzero()[0].tolist()
         return near
 
     def _compute(self, q: Array, pairs: NDArray[np.intp], bounds: Array) -> None:
@@ -182,12 +190,11 @@ class PairBounds:
         model.place(q)
         if 2 * len(pairs) > model.count:
             self.distances = model.distances()
-            self._at[:] = q
+            self._at[:] = q[:, np.newaxis]
             bounds[:] = self.distances
             return
-        for k in pairs.tolist():
-            self.distances[k] = bounds[k] = model.distance(k)
-            self._at[k] = q
+        self.distances[pairs] = bounds[pairs] = [model.distance(k) for k in pairs.tolist()]
+        self._at[:, pairs] = q[:, np.newaxis]
 
     def nearest(self, q: Array) -> tuple[int, float]:
         """Return the nearest pair at ``q`` (n,), rad, and its distance, m."""
@@ -195,7 +202,7 @@ class PairBounds:
             raise NotSupported("no collisions are checked for this arm", code="nothing_checked")
         self.model.place(q)
         self.distances = self.model.distances()
-        self._at[:] = q
+        self._at[:] = q[:, np.newaxis]
         k = int(np.argmin(self.distances))
         return k, float(self.distances[k])
 

@@ -96,8 +96,11 @@ def divide_urdf(robot: UrdfModel, joints: Collection[str], others: Collection[st
 
 
 def _keep(root: ElementTree.Element, stem: str) -> Path:
-    """Write a URDF into the cache, unless it is there, and return its path."""
-    data = ElementTree.tostring(root, encoding="utf-8")
+    return keep_urdf(ElementTree.tostring(root, encoding="utf-8"), stem)
+
+
+def keep_urdf(data: bytes, stem: str) -> Path:
+    """Write a URDF into the cache, unless it is there, and return its path; ``stem`` begins its name."""
     place = _cache_folder() / f"{stem}-{hashlib.sha256(data).hexdigest()[:16]}.urdf"
     if not place.is_file() or place.read_bytes() != data:
         place.parent.mkdir(parents=True, exist_ok=True)

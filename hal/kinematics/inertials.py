@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import rpy_to_matrix
-from .mesh_files import mesh_file
+from .mesh_files import hull_points, mesh_file
 from .urdf import UrdfModel, parse_xml, read_urdf
 
 Array = NDArray[np.float64]
@@ -145,13 +145,11 @@ def _bounds(shape: ElementTree.Element | None, folder: Path) -> Any:
 
 @lru_cache(maxsize=256)
 def _mesh_bounds(file: Path, scale: str) -> Any:
-    import trimesh  # 0.3 s
-
     try:
-        bounds: Any = trimesh.load(str(file), force="mesh").bounds
-        return tuple(np.sort(bounds * np.array(scale.split()[:3], float), axis=0))
+        corners = hull_points(file) * np.array(scale.split()[:3], float)
     except Exception:  # a mesh that is empty, or that nothing can read; the simulation reports it
         return None
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def _origin(element: ElementTree.Element | None) -> tuple[Array, Array]:

@@ -1,21 +1,19 @@
-"""Takeover: a person corrects a policy with a pad while it runs, and gives the arm back by letting go."""
+"""Takeover: a person corrects a policy with a pad or a leader while it runs, and gives the arm back by letting go."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..commands import Twist
+    from ..commands import Command
     from ..gamepad import Gamepad
     from ..teleop import Teleop
-    from ..types import PadState
-
-_PRESSED = 0.05
-"""Share of a trigger's travel from which it counts as pressed."""
 
 
 class Takeover:
     """Decides in each turn who drives: a person, while any control that moves the arm or its gripper is held.
+
+    A leader has a button for that (``take_over`` of its mapping).
 
     The arm goes back to the policy when all of them have been at rest for a while, in which it comes to rest. The
     gripper keeps what it holds: a trigger acts only after it has crossed the present grip.
@@ -28,6 +26,7 @@ class Takeover:
 
     def __init__(self, teleop: Teleop, pad: Gamepad, release: float = 0.3) -> None:
         self.teleop, self.pad, self.release = teleop, pad, release
+        teleop.prepare_takeover()
         self.active = False
         """Whether the person drives."""
         self.intervals: list[tuple[float, float]] = []
@@ -38,7 +37,7 @@ class Takeover:
         """Begin an episode: the policy drives, and :attr:`intervals` is empty."""
         self.active, self.intervals = False, []
 
-    def command(self, now: float, dt: float) -> tuple[Twist, float | None] | None:
+    def command(self, now: float, dt: float) -> tuple[Command, float | None] | None:
         """Return the person's command and grip; None while the policy drives.
 
         Args:
@@ -46,7 +45,7 @@ class Takeover:
             dt: Time since the last turn, s.
         """
         state = self.pad.state()
-        if self._is_touched(state):
+        if self.teleop.is_touched(state):
             self._touched = now
             if not self.active:
                 self.active = True
@@ -58,15 +57,4 @@ class Takeover:
         if now - self._touched >= self.release:
             self.active = False
             return None
-        return self.teleop.step(state, dt)
-
-    def _is_touched(self, state: PadState) -> bool:
-        mapping = self.teleop.mapping
-        if any(mapping.twist(state)):
-            return True
-        gripper = mapping.gripper
-        if gripper is None:
-            return False
-        if gripper.axis is not None:
-            return state.axis(gripper.axis) > _PRESSED
-        return any(state.pressed(button) for button in (gripper.open, gripper.close, gripper.toggle) if button)
+        return self.teleop.command(state, dt)

@@ -32,6 +32,7 @@ def _key() -> dict[str, int]:
     codes.update({f"BTN_{name}": 0x130 + place for place, name in enumerate((*gamepad, "THUMBL", "THUMBR"))})
     codes.update({f"BTN_DPAD_{name}": 0x220 + place for place, name in enumerate(("UP", "DOWN", "LEFT", "RIGHT"))})
     codes.update({f"BTN_TRIGGER_HAPPY{number}": 0x2C0 + number - 1 for number in range(1, 41)})
+    codes |= {"KEY_A": 30, "KEY_B": 48, "KEY_C": 46}  # of foot switches
     codes |= {"BTN_LEFT": 0x110, "KEY_MENU": 139, "KEY_BACK": 158, "KEY_RECORD": 167, "KEY_HOMEPAGE": 172}
     return codes
 

@@ -1,4 +1,4 @@
-"""Change finished episodes where they are: their marks, or the values of columns.
+"""Change the marks of finished episodes where they are.
 
 Only the files that hold these episodes are written, anew, in ``episodes/change.partial``. Then a list of their
 destinations is written: from here on the change counts as made, and whatever opens the dataset next to write into it
@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from .codecs import column_stats, exchange_flags, stats_as_lists
 from .dataset import Dataset
 from .finish import last_row, move_files, recover_all, write_table
 from .foreign import is_foreign
-from .index import column_values, make_column, merged_stats, read_stats, read_table
+from .index import column_values, make_column, read_stats, read_table
 from .layout import (
     MOVES,
     SUCCESS,
@@ -34,15 +34,6 @@ from .layout import (
     write_json,
 )
 from .validation import dataset_errors
-
-
-class EpisodeChange(NamedTuple):
-    """What changes in a finished episode."""
-
-    about: Mapping[str, Any]
-    """Entries of ``episodes/N.json``."""
-    columns: Mapping[str, NDArray[Any]]
-    """New values (rows, n) of columns, by their stored keys."""
 
 
 def mark_episodes(dataset: str | Path | Dataset, marks: Mapping[int, bool | None]) -> None:
@@ -58,15 +49,16 @@ def mark_episodes(dataset: str | Path | Dataset, marks: Mapping[int, bool | None
     """
     with open_to_change(dataset) as opened:
         existing_episodes(opened, marks)
-        changes = {}
-        for number, mark in marks.items():
-            episode = opened.episodes[number]
-            before = episode.success
-            if mark is not before:
-                rows = SUCCESS in opened.info["features"] and (mark is True) is not (before is True)
-                columns = {SUCCESS: last_row(episode.length, mark is True)} if rows else {}
-                changes[number] = EpisodeChange({"success": mark}, columns)
-        change_episodes(DatasetLayout(opened.root), changes)
+        before = {number: opened.episodes[number].success for number in marks}
+        changed = {number: mark for number, mark in marks.items() if mark is not before[number]}
+        has_rows = SUCCESS in opened.info["features"]
+        rows = {
+            number: last_row(opened.episodes[number].length, mark is True)
+            for number, mark in changed.items()
+            if has_rows and (mark is True) is not (before[number] is True)
+        }
+        if changed:
+            _change_marks(DatasetLayout(opened.root), changed, rows)
 
 
 def existing_episodes(dataset: Dataset, episodes: Iterable[int]) -> frozenset[int]:
@@ -110,10 +102,16 @@ def open_to_change(dataset: str | Path | Dataset) -> Iterator[Dataset]:
         yield known or Dataset(layout.root)
 
 
-def change_episodes(layout: DatasetLayout, changes: Mapping[int, EpisodeChange]) -> None:
-    """Change episodes of a dataset that is locked (:func:`open_to_change`); all of them or, on an error, none."""
-    if not changes:
-        return
+def _change_marks(
+    layout: DatasetLayout, marks: Mapping[int, bool | None], rows: Mapping[int, NDArray[np.bool_]]
+) -> None:
+    """Change marks in a dataset that is locked (:func:`open_to_change`); all of them or, on an error, none.
+
+    Args:
+        layout: The dataset.
+        marks: The new marks by number of the episode.
+        rows: New values (rows, 1) of the column of successes, where they change.
+    """
     folder, moves = layout.change, list[tuple[str, str]]()
 
     def put(target: Path, write: Callable[..., object], *content: Any) -> None:
@@ -123,21 +121,20 @@ def change_episodes(layout: DatasetLayout, changes: Mapping[int, EpisodeChange])
 
     folder.mkdir()
     try:
-        places = {number: EpisodePlace.of(number, read_about(layout, number)) for number in changes}
-        for file in sorted({place.data[0] for number, place in places.items() if changes[number].columns}):
-            first = {number: place.data[1] for number, place in places.items() if place.data[0] == file}
-            put(layout.data(file), _write_rows, layout, file, first, changes)
+        places = {number: EpisodePlace.of(number, read_about(layout, number)) for number in marks}
+        for file in sorted({places[number].data[0] for number in rows}):
+            first = {number: places[number].data[1] for number in rows if places[number].data[0] == file}
+            put(layout.data(file), _write_rows, layout, file, first, rows)
         before, after = {}, {}
         for path in sorted({layout.entry(place.entry) for place in places.values()}):
             with dataset_errors(layout.root, path):
                 before[path] = read_table(path)
-                after[path] = _changed_entries(before[path], changes)
+                after[path] = _changed_entries(before[path], marks, rows)
             put(path, write_table, after[path])
-        for number, change in changes.items():
-            data = read_json(layout.about(number)) | change.about
-            put(layout.about(number), write_json, data, None)
-        if keys := {key for change in changes.values() for key in change.columns}:
-            put(layout.stats, write_json, _changed_stats(layout, keys, before, after))
+        for number, mark in marks.items():
+            put(layout.about(number), write_json, read_json(layout.about(number)) | {"success": mark}, None)
+        if rows:
+            put(layout.stats, write_json, _changed_stats(layout, before, after))
         put(layout.info, _copy, layout.info)  # last, and new, so that the change is noticed
         write_json(folder / MOVES, moves)
     except BaseException:
@@ -153,27 +150,24 @@ def _copy(new: Path, source: Path) -> None:
 
 
 def _write_rows(
-    new: Path, layout: DatasetLayout, file: int, first: Mapping[int, int], changes: Mapping[int, EpisodeChange]
+    new: Path, layout: DatasetLayout, file: int, first: Mapping[int, int], rows: Mapping[int, NDArray[np.bool_]]
 ) -> None:
-    """Write a file of rows with the changed values; ``first`` has the place of each episode's first row in it."""
+    """Write a file of rows with the changed successes; ``first`` has the place of each episode's first row in it."""
     import pyarrow.parquet as pq
 
     path = layout.data(file)
     with dataset_errors(layout.root, path), pq.ParquetFile(path, page_checksum_verification=True) as old:
         sizes = [old.metadata.row_group(k).num_rows for k in range(old.metadata.num_row_groups)]
         table = old.read(use_threads=False)
-    owners = table["episode_index"].to_numpy()
-    for key in dict.fromkeys(key for number in first for key in changes[number].columns):
-        field = table.schema.field(key)
-        values = column_values(table[key]).copy()
-        for number, begin in first.items():
-            if key in changes[number].columns:
-                rows = changes[number].columns[key]
-                if set(owners[begin : begin + len(rows)].tolist()) != {number}:
-                    name = str(path.relative_to(layout.root))
-                    raise DatasetError("has rows of another episode", file=name, episode=number)
-                values[begin : begin + len(rows)] = rows
-        table = table.set_column(table.schema.get_field_index(key), field, make_column(values).cast(field.type))
+    owners, field = table["episode_index"].to_numpy(), table.schema.field(SUCCESS)
+    values = column_values(table[SUCCESS]).copy()
+    for number, begin in first.items():
+        end = begin + len(rows[number])
+        if set(owners[begin:end].tolist()) != {number}:
+            name = str(path.relative_to(layout.root))
+            raise DatasetError("has rows of another episode", file=name, episode=number)
+        values[begin:end] = rows[number]
+    table = table.set_column(table.schema.get_field_index(SUCCESS), field, make_column(values).cast(field.type))
     with pq.ParquetWriter(new, table.schema, write_page_checksum=True) as writer:
         begin = 0
         for size in sizes:
@@ -182,41 +176,32 @@ def _write_rows(
     sync_to_disk(new)
 
 
-def _changed_stats(
-    layout: DatasetLayout, keys: Set[str], old: Mapping[Path, Any], new: Mapping[Path, Any]
-) -> dict[str, Any]:
-    """Return ``meta/stats.json`` after files of ``meta/episodes`` have changed.
-
-    Those of columns of flags, such as marks, follow from the changed files alone; for others all files are read.
-    """
+def _changed_stats(layout: DatasetLayout, old: Mapping[Path, Any], new: Mapping[Path, Any]) -> dict[str, Any]:
+    """Return ``meta/stats.json`` after marks in files of ``meta/episodes`` have changed; no other file is read."""
     with dataset_errors(layout.root, layout.stats):
         stats: dict[str, Any] = read_json(layout.stats)
-        flags = {key for key in keys if read_json(layout.info)["features"][key]["dtype"] == "bool"}
-        found = merged_stats(layout, keys - flags, new) if keys - flags else {}
-        for key in flags:
-            found[key] = {name: np.asarray(value) for name, value in stats[key].items()}
-            for path in old:
-                before, after = (read_stats(each[path], {key})[key] for each in (old, new))
-                found[key] = exchange_flags(found[key], before, after)
-    return stats | stats_as_lists(found)
+        found = {name: np.asarray(value) for name, value in stats[SUCCESS].items()}
+        for path in old:
+            before, after = (read_stats(each[path], {SUCCESS})[SUCCESS] for each in (old, new))
+            found = exchange_flags(found, before, after)
+    return stats | stats_as_lists({SUCCESS: found})
 
 
-def _changed_entries(table: Any, changes: Mapping[int, EpisodeChange]) -> Any:
+def _changed_entries(table: Any, marks: Mapping[int, bool | None], rows: Mapping[int, NDArray[np.bool_]]) -> Any:
     """Return the rows of a file of ``meta/episodes`` with new marks and statistics."""
     import pyarrow as pa
 
     numbers = table["episode_index"].to_pylist()
     new: dict[str, dict[int, Any]] = {}
-    for number in changes.keys() & set(numbers):
-        row, change = numbers.index(number), changes[number]
-        if "success" in change.about and "success" in table.column_names:
-            new.setdefault("success", {})[row] = change.about["success"]
-        for key, values in change.columns.items():
-            for name, value in column_stats(values).items():
-                new.setdefault(f"stats/{key}/{name}", {})[row] = value.tolist()
-    for name, rows in new.items():
+    for number in marks.keys() & set(numbers):
+        row = numbers.index(number)
+        if "success" in table.column_names:
+            new.setdefault("success", {})[row] = marks[number]
+        for name, value in column_stats(rows[number]).items() if number in rows else ():
+            new.setdefault(f"stats/{SUCCESS}/{name}", {})[row] = value.tolist()
+    for name, changed in new.items():
         values = table[name].to_pylist()
-        for row, value in rows.items():
+        for row, value in changed.items():
             values[row] = value
         field = table.schema.field(name)
         table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))

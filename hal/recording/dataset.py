@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import weakref
 from bisect import bisect_left, bisect_right
@@ -23,9 +22,7 @@ from .codecs import DepthReader
 from .foreign import is_foreign, read_foreign
 from .index import read_index, repair_command
 from .layout import (
-    GRIP_FORCE,
     MORE_STREAMS,
-    SETPOINT,
     SUCCESS,
     TIMES,
     DatasetLayout,
@@ -118,7 +115,7 @@ class KeptRows(NamedTuple):
     """Row after the last one."""
 
 
-_MAY_CHANGE = dict.fromkeys(("common", "files", "grasps", "success", "task"))
+_MAY_CHANGE = dict.fromkeys(("common", "files", "success", "task"))
 """Metadata that an episode can get later."""
 
 
@@ -535,25 +532,11 @@ class Dataset:
         self.root = layout.root
         self.info: dict[str, Any] = info
         """``meta/info.json``."""
-        self._notes = () if foreign is None else foreign.notes
+        self.notes: tuple[str, ...] = () if foreign is None else foreign.notes
+        """What is missing in a dataset that another program edited or recorded."""
         self.fps: int = info["fps"]
         abouts = [None] * info["total_episodes"] if foreign is None else foreign.episodes
         self.episodes = tuple(Episode(layout, number, info, about) for number, about in enumerate(abouts))
-
-    @cached_property
-    def notes(self) -> tuple[str, ...]:
-        """What is missing in a dataset that another program edited or recorded, or that an earlier version recorded."""
-        if not lacks_grip_force(self.info["features"]):
-            return self._notes
-        repaired = False
-        with contextlib.suppress(DatasetError):  # reported when the episode is read
-            repaired = "grasps" in self.episodes[0].info
-        what = "only proven ones were repaired" if repaired else "hal dataset repair closes those that can be proven"
-        return (
-            *self._notes,
-            f"recorded by an earlier version, without {GRIP_FORCE}: a grasp of a script or a skill is the width of its "
-            f"object in action and {SETPOINT}, and not a closed hand ({what}); how hard the fingers pressed is unknown",
-        )
 
     def has_changed(self) -> bool:
         """Return whether episodes were added, removed or changed since the dataset was opened."""
@@ -564,13 +547,6 @@ class Dataset:
 
     def __repr__(self) -> str:
         return f"<Dataset {self.root}: {len(self.episodes)} episodes, {self.info['total_frames']} rows>"
-
-
-def lacks_grip_force(features: Mapping[str, Any]) -> bool:
-    """Return whether columns are those of an arm with a gripper, but without the force that was asked of it."""
-    stored = {current_key(key): feature for key, feature in features.items()}
-    names = stored.get(SETPOINT, {}).get("names") or []
-    return GRIP_FORCE not in stored and any(name.split(".")[-1] == "gripper" for name in names)
 
 
 def _hint(layout: DatasetLayout) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -172,31 +172,20 @@ def read_stats(table: Any, keys: Collection[str] | None = None) -> dict[str, dic
     return found
 
 
-def stats_parts(
-    layout: DatasetLayout, keys: Collection[str] | None = None, known: Mapping[Path, Any] | None = None
-) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
+def stats_parts(layout: DatasetLayout) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
     """Yield the statistics of each column and video in each file of ``meta/episodes``, as :func:`read_stats` does.
 
-    Args:
-        layout: The dataset.
-        keys: Columns and videos; None for all.
-        known: Content of files to use instead of those on the disk.
-
-    Raises:
-        DatasetError: A file is damaged.
+    Raises DatasetError if a file is damaged.
     """
     for path in sorted(layout.entry(0).parent.parent.glob("*/*.parquet")):
         with dataset_errors(layout.root, path):
-            table = known[path] if known and path in known else read_table(path)
-            yield from read_stats(table, keys).items()
+            yield from read_stats(read_table(path)).items()
 
 
-def merged_stats(
-    layout: DatasetLayout, keys: Collection[str] | None = None, known: Mapping[Path, Any] | None = None
-) -> dict[str, Stats]:
-    """Return the statistics over all episodes; arguments and errors are those of :func:`stats_parts`."""
+def merged_stats(layout: DatasetLayout) -> dict[str, Stats]:
+    """Return the statistics over all episodes. Raises DatasetError if a file is damaged."""
     parts: dict[str, list[Stats]] = {}
-    for key, found in stats_parts(layout, keys, known):
+    for key, found in stats_parts(layout):
         parts.setdefault(key, []).append(merge_stacked(found))
     return {key: merge_stats(found) for key, found in parts.items()}
 

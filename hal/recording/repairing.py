@@ -10,7 +10,7 @@ from ..errors import CommandError, DatasetError
 from .about import read_about
 from .checking import check_index, check_rows
 from .codecs import Stats, merge_stats, stats_as_lists
-from .dataset import Dataset, Episode
+from .dataset import Episode
 from .finish import (
     entries_table,
     entry_row,
@@ -22,7 +22,6 @@ from .finish import (
     totals,
     write_table,
 )
-from .grasps import repair_grasps
 from .index import merged_stats, stray_files, validated_info
 from .layout import (
     DatasetLayout,
@@ -63,9 +62,7 @@ def recover(out: str | Path) -> list[str]:
 def repair(out: str | Path) -> list[str]:
     """Rebuild the index of the dataset in the folder ``out`` if it does not match the episodes, then recover it.
 
-    The index is all of ``meta/``. It is rebuilt from ``episodes/``, ``data/`` and ``videos/``. Grasps that an earlier
-    version recorded as the width of the object become a closed hand where they can be proven
-    (:mod:`~hal.recording.grasps`).
+    The index is all of ``meta/``. It is rebuilt from ``episodes/``, ``data/`` and ``videos/``.
     Arguments, return value and errors are those of :func:`recover`; DatasetError names the file of an episode without
     which the index cannot be rebuilt.
     """
@@ -81,8 +78,7 @@ def repair(out: str | Path) -> list[str]:
             done.append(f"{_rebuild(layout, wrong)}; it was wrong: {wrong[0]}")
             for left in check_index(layout):
                 raise left
-        done += recover_all(layout)
-        return done + (repair_grasps(layout, Dataset(layout.root).episodes) if layout.info.exists() else [])
+        return done + recover_all(layout)
 
 
 def _layout(out: str | Path) -> DatasetLayout:

@@ -164,7 +164,7 @@ class CollisionGuard:
         if not near:
             return dq
         before = around.bounds.distances[near]
-        fastest = around.model.levers[near, around.own] @ np.abs(dq)
+        fastest = around.model.levers[near][:, around.own].dot(np.abs(dq))
         greatest = float(fastest.max())
         if greatest <= 0.0:
             return dq
@@ -290,7 +290,7 @@ class CollisionGuard:
         around = self._around
         taken = around.approach_of_others(pairs)
         least = around.model.margins[pairs] - _TOLERANCE
-        own = around.model.levers[pairs, around.own]
+        own = around.model.levers[pairs][:, around.own]
 
         def look(u: float) -> tuple[float, Array]:
             return u, np.array(around.lowest(pairs, [stop.at(u)]))
@@ -337,16 +337,16 @@ class _Surroundings:
         self._q: Array = np.zeros(model.n)
         self._ways: Array = np.zeros(model.n)
         n = self.own.stop - self.own.start
-        self._scales: Array = np.ones((1, n))
+        self._squared_scales: Array = np.ones((1, n))
         self.last: Floats = ()
         """Joint positions (n,), rad, of the newest call of :meth:`is_clear` that returned true, and the share of the
         room that was left there."""
         self.left = 0.0
         self.shares: list[float] = []
-        """The share of all room that the length of each vector of :meth:`measure_ways` takes at most."""
+        """The share of any pair's room that the length of each vector of :meth:`measure_ways` takes at most."""
         self._weights, self._turned, self._per_turn = [inf] * n, inf, inf
-        """The share of the room that each rad of each joint takes (n,); that the turns from the computed positions to
-        some later ones have taken; and that each rad of the joints together takes."""
+        """The share of any pair's room that each rad of each joint takes at most (n,); that the turns from the computed
+        positions to some later ones have taken; and that each rad of the joints together takes."""
         self._at: Floats = (0.0,) * n
         self._later: Floats = self._at
         self._others_at: list[tuple[Neighbour, Floats, float]] = []
@@ -355,9 +355,10 @@ class _Surroundings:
 
     def measure_ways(self, *scales: Floats) -> None:
         """Measure the joints' ways by vectors: joint j goes at most ``scale[j] * vector[j]``, in rad, for each."""
-        self._scales = np.array(scales)
+        self._squared_scales = np.square(scales)
         self.shares = [inf] * len(scales)
-        self._weights, self._turned, self.left = [inf] * len(self._at), inf, -inf
+        self._weights, self._turned, self._per_turn = [inf] * len(self._at), inf, inf
+        self.left = -inf
 
     def is_clear(self, q: Floats, taken: float) -> bool:
         """Return whether no pair can get near from ``q`` (n,) on ways that take this share of the room."""
@@ -369,9 +370,9 @@ class _Surroundings:
         if not taken <= left:
             if self._per_turn == inf:
                 return False
-            turned = sum([w * abs(x - x0) for w, x, x0 in zip(self._weights, q, self._at, strict=True)])
+            turned = float(np.abs(np.subtract(q, self._at)).dot(self.bounds.shares[self.own]).max(initial=0.0))
             left = room - turned
-            if taken > left:
+            if not taken <= left:  # NaN too
                 return False
             self._later, self._turned = tuple(q), turned
         self.last, self.left = q, left
@@ -388,10 +389,11 @@ class _Surroundings:
             there, end = neighbour()
             self._q[part], self._ways[part] = there, np.abs(np.subtract(end, there))
         near = self.bounds.near(self._q, self._ways, self.least)
-        weights = self.bounds.weights
-        own = weights[self.own]
-        self._weights, self._turned, self._per_turn = own.tolist(), 0.0, sqrt(own.dot(own))
-        self.shares = np.sqrt(np.square(self._scales * own).sum(axis=1)).tolist()
+        weights, own = self.bounds.weights, self.own
+        self._weights, self._turned = weights[own].tolist(), 0.0
+        squares = np.square(self.bounds.shares[own])
+        self._per_turn = sqrt(squares.sum(axis=0).max(initial=0.0))
+        self.shares = np.sqrt(self._squared_scales.dot(squares).max(axis=1, initial=0.0)).tolist()
         self._at = self._later = tuple(q)
         self.last = ()
         self._others_at = [
@@ -402,6 +404,8 @@ class _Surroundings:
 
     def approach_of_others(self, pairs: Sequence[int]) -> Array:
         """Return how much nearer (pairs,), m, the shapes come at most while the other arms stop."""
+        if not self._others:
+            return np.zeros(len(pairs))
         levers, own = self.model.levers[pairs], self.own
         taken: Array = levers @ self._ways - levers[:, own] @ self._ways[own]
         return taken

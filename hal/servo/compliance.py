@@ -185,8 +185,8 @@ class Compliance:
         (q_due, dq_due), tcp = self._due, torque.tcp()
         acceleration = np.array(smoother.dq)
         acceleration -= dq_due
-        acceleration *= torque.bounds.feeds(tcp.velocity) / smoother.dt
-        torque.drive(law, law.torques(arm, tcp, (q_due, dq_due, acceleration), self._error), arm, tcp.velocity)
+        acceleration *= torque.bounds.feeds(tcp.speed) / smoother.dt
+        torque.drive(law, law.torques(arm, tcp, (q_due, dq_due, acceleration), self._error), arm, tcp)
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""
@@ -194,7 +194,7 @@ class Compliance:
         bounds, arm = torque.bounds, torque.arm
         if bounds is None or arm is None:
             return None
-        limit = bounds.strays(arm, torque.tcp().velocity)
+        limit = bounds.strays(arm, torque.tcp().speed)
         if limit is None and collisions is not None and not collisions.allows_arm(arm.q, arm.dq, _PUSHED):
             limit = Limited.COLLISION
         return limit

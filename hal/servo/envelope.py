@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain
 from math import dist, hypot, inf, sqrt
 from operator import mul
 from typing import TYPE_CHECKING, Any
@@ -65,8 +64,6 @@ class TcpReference:
         """Joint positions of the reference (n,), rad; infinite before the first one."""
         self._pose: Pose7 = (inf,) * 7
         self._jacobian: Any = None
-        self._rows: list[list[float]] = []
-        """The linear Jacobian there, (3, n)."""
         self._curvature: Any = None
         """Their derivatives by each joint, (n, 3 n); None until they are needed."""
         self._centre: Floats = (0.0,) * smoother.n
@@ -141,18 +138,18 @@ class TcpReference:
             self._centre_speed += self._spread * dist(q, self._at) * self._centre_length
         pose, jacobian = self._kinematics.fk_and_jacobian(q)
         self._at, self._pose, self._jacobian = q, pose, jacobian
-        self._rows = jacobian[:3].tolist()
+        linear = jacobian[:3]
         self._curvature = None
-        self._stretch = hypot(*chain.from_iterable(self._rows))
-        box = self._workspace
-        if box is not None:
-            sides = zip(pose, box.lower, box.upper, strict=False)
-            self._clearance = min([min(x - low, high - x) for x, low, high in sides])
+        self._stretch = sqrt(np.vdot(linear, linear))
+        if self._workspace is not None:
+            (a, b, c), (d, e, f) = self._workspace.lower, self._workspace.upper
+            x, y, z, *_ = pose
+            self._clearance = min(x - a, y - b, z - c, d - x, e - y, f - z)
 
     def velocity(self, dq: Floats) -> list[float]:
         """Return the linear velocity (3,) of the tcp for joint speeds ``dq`` (n,) at the set-point, base axes, m/s."""
         self._refresh()
-        return [sum(map(mul, row, dq)) for row in self._rows]
+        return [sum(map(mul, row, dq)) for row in self._jacobian[:3].tolist()]
 
     def surely_slower(self, dq: Floats, cap: float) -> bool:
         """Return whether the tcp provably stays below ``cap`` (m/s) while the joints change their speeds.
@@ -173,7 +170,7 @@ class TcpReference:
         """Compute the tcp's greatest speed for all shares of the joint speeds ``dq`` (n,), rad/s."""
         self._refresh()
         axes = []
-        for row in self._rows:
+        for row in self._jacobian[:3].tolist():
             parts = list(map(mul, row, dq))
             axes.append(0.5 * (sum(map(abs, parts)) + abs(sum(parts))))  # the greater of the axis' two directions
         self._centre, self._centre_speed, self._centre_length = dq, hypot(*axes), hypot(*dq)
@@ -198,14 +195,17 @@ class TcpReference:
         q, dq, dt = smoother.q, smoother.dq_next, smoother.dt
         speed, acceleration = hypot(*dq), hypot(*smoother.ddq_next)
         if speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True)):
-            mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
-            step = hypot(*mean)
+            step = dist(smoother.q_next, q) / dt
             # In its stop no joint gets faster than its speed and what its acceleration adds until it is taken back.
             fastest = self._root * max(speed + self._overrun * acceleration, step)
             way = self._reach_length * step * dt + self._per_speed * speed + self._per_acceleration * acceleration
             ramps = self._overrun_tcp * acceleration * acceleration + fastest * way
+            changes = ramps + fastest * self._reach_length * dist(q, self._at)
+            if self._stretch * max(speed, step) + changes <= cap:
+                return True
+            mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
             near = self._centre_speed + self._stretch * max(dist(dq, self._centre), dist(mean, self._centre))
-            if near + ramps + fastest * self._reach_length * dist(q, self._at) <= cap:
+            if near + changes <= cap:
                 return True
             if self._like_proven_stop(mean, fastest) <= cap:
                 return True

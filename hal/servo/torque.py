@@ -8,6 +8,7 @@ be at rest it is held there by positions again.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -126,7 +127,8 @@ class TorqueMotion(ServoMotion):
         if self._tcp is None:
             q, dq = np.array((self.q, self.dq))
             pose, jacobian = self.envelope.kinematics.fk_and_jacobian(q)
-            self._tcp = TcpInMotion(pose, jacobian, jacobian[:3].dot(dq), q, dq)
+            velocity = jacobian[:3].dot(dq)
+            self._tcp = TcpInMotion(pose, jacobian, velocity, sqrt(velocity.dot(velocity)), q, dq)
         return self._tcp
 
     def _update_inertia(self) -> None:
@@ -220,7 +222,7 @@ class TorqueMotion(ServoMotion):
                 self.tau, self._share = self.bounds.brake(before, arm, 0.0)
         self._begun = True
 
-    def drive(self, law: ControllerLaw, tau: Array, arm: ArmInMotion, velocity: Array) -> None:
+    def drive(self, law: ControllerLaw, tau: Array, arm: ArmInMotion, tcp: TcpInMotion) -> None:
         """Move the torques by one tick towards those of a controller (see :meth:`TorqueBounds.shared`).
 
         The first set-point has none: it changes the mode.
@@ -228,7 +230,7 @@ class TorqueMotion(ServoMotion):
         self._braking = self._share = 0.0
         if self._begun:
             assert self.bounds is not None
-            goal = self.bounds.shared(tau, law.gain, law.most_gain, arm, velocity)
+            goal = self.bounds.shared(tau, law.gain, law.most_gain, arm, tcp)
             self.tau = self.bounds.together(self.tau, goal)
         self._begun = True
 

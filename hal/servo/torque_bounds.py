@@ -153,6 +153,8 @@ class TcpInMotion(NamedTuple):
     """(6, n), along the base's axes."""
     velocity: Array
     """(3,), m/s."""
+    speed: float
+    """Its length, m/s."""
     q: Array
     """Joint positions (n,), rad."""
     dq: Array
@@ -225,19 +227,18 @@ class TorqueBounds:
         brake = (1.0 - share) * self._decay * max(0.0, excess)
         return [share * x - brake * p for x, p in zip(slowed, arm.inertia.momentum(arm.dq), strict=True)]
 
-    def feeds(self, velocity: Array) -> float:
-        """Return the share (0..1) of a set-point's acceleration that an arm at ``velocity`` (3,) of its tcp, m/s, gets.
+    def feeds(self, speed: float) -> float:
+        """Return the share (0..1) of a set-point's acceleration that an arm whose tcp has this speed, m/s, gets.
 
         An arm that springs made faster than its set-point must not become faster still while the set-point catches up.
         """
         most = self.tcp_speed
         if most >= UNLIMITED:
             return 1.0
-        speed = sqrt(velocity.dot(velocity))
         return max(0.0, min(1.0, (_FED * most - speed) / ((_FED - _SPRINGS) * most)))
 
     def shared(
-        self, tau: Array, gain: Callable[[], Array], most_gain: float, arm: ArmInMotion, velocity: Array
+        self, tau: Array, gain: Callable[[], Array], most_gain: float, arm: ArmInMotion, tcp: TcpInMotion
     ) -> list[float]:
         """Return the torques (n,) to move towards, Nm: a controller's, with as much of the springs as keeps the speeds.
 
@@ -247,7 +248,7 @@ class TorqueBounds:
             gain: Returns the velocity (3,) of the tcp, m/s, that the springs may still add.
             most_gain: An upper bound of its length, m/s.
             arm: Measured state.
-            velocity: Velocity (3,) of its tcp, m/s.
+            tcp: That of its tcp.
         """
         envelope = self._envelope
         slowed, more = (arm.inertia.solve(tau.T).T * self._lag).tolist()
@@ -258,8 +259,8 @@ class TorqueBounds:
             if share < 1.0:
                 envelope.limited |= Limited.SPEED
         cap = _SPRINGS * self.tcp_speed
-        if self.tcp_speed < UNLIMITED and not sqrt(velocity.dot(velocity)) + most_gain <= cap:
-            tcp_share = _greatest_share(velocity, gain(), cap)
+        if self.tcp_speed < UNLIMITED and not tcp.speed + most_gain <= cap:
+            tcp_share = _greatest_share(tcp.velocity, gain(), cap)
             if tcp_share < 1.0:
                 envelope.limited |= Limited.TCP_SPEED
                 share = min(share, tcp_share)
@@ -397,19 +398,19 @@ class TorqueBounds:
                 return Limited.COLLISION
         return None
 
-    def strays(self, arm: ArmInMotion, velocity: Array) -> Limited | None:
+    def strays(self, arm: ArmInMotion, tcp_speed: float) -> Limited | None:
         """Return the limit that an arm exceeds whose set-point keeps all of them; None if it keeps all.
 
         That are its own joint speeds, half as much again as the session's tcp speed, and its ranges.
 
         Args:
             arm: Measured state.
-            velocity: Velocity (3,) of its tcp, m/s.
+            tcp_speed: That of its tcp, m/s.
         """
         limits = self._limits.velocity
         if hypot(*arm.dq) > self._slowest and any(abs(v) > most for v, most in zip(arm.dq, limits, strict=True)):
             return Limited.SPEED
-        if sqrt(velocity.dot(velocity)) > _RUNAWAY * self.tcp_speed:
+        if tcp_speed > _RUNAWAY * self.tcp_speed:
             return Limited.TCP_SPEED
         if dist(arm.q, self._middle) > self._radius:
             for x, (low, high) in zip(arm.q, self._ranges, strict=True):

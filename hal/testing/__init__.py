@@ -28,7 +28,10 @@ except ImportError as error:
     ) from error
 
 pytest.register_assert_rewrite(
-    *(f"{__name__}.{part}" for part in ("benches", "camera", "gamepad", "gripper", "hosting", "robot", "world"))
+    *(
+        f"{__name__}.{part}"
+        for part in ("benches", "camera", "gamepad", "gripper", "hosting", "leader", "robot", "world")
+    )
 )
 
 from .benches import (  # noqa: E402
@@ -49,6 +52,7 @@ from .camera import CameraContract  # noqa: E402
 from .gamepad import GamepadContract  # noqa: E402
 from .gripper import GripperContract  # noqa: E402
 from .holding import HoldResult, hold_object  # noqa: E402
+from .leader import LeaderContract  # noqa: E402
 from .robot import RobotContract  # noqa: E402
 from .world import WorldContract  # noqa: E402
 from .world_bench import WorldBench  # noqa: E402
@@ -62,6 +66,7 @@ __all__ = [
     "GripperBench",
     "GripperContract",
     "HoldResult",
+    "LeaderContract",
     "PadBench",
     "RobotBench",
     "RobotContract",

@@ -6,7 +6,6 @@ To add a driver, write a bench in a file beside this one and a class here.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -17,6 +16,7 @@ from hal.testing import (
     GamepadContract,
     GripperBench,
     GripperContract,
+    LeaderContract,
     RobotBench,
     RobotContract,
     WorldContract,
@@ -44,6 +44,7 @@ from .can_arms import piper_arm, piper_gripper
 from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
+from .leaders import feetech_leader, mock_leader
 from .pads import mock_pad, playback_pad, terminal_steps, web_pad
 from .robotiqs import robotiq_gripper
 from .servo_buses import servo_bus_arm, servo_bus_gripper
@@ -136,16 +137,16 @@ class TestEmulatedFr3(
             yield bench
 
 
-@pytest.fixture(scope="class")
-def ur(request: pytest.FixtureRequest) -> Iterator[Ur]:
-    """An emulated arm of Universal Robots."""
-    robot = Ur(request.cls.model)
+@pytest.fixture(scope="module")
+def ur() -> Iterator[Ur]:
+    """An emulated UR5e."""
+    robot = Ur()
     yield robot
     robot.close()
 
 
 @pytest.mark.slow
-@pytest.mark.alone  # in real time
+@pytest.mark.pair  # in real time
 class TestEmulatedUr5e(
     RobotContract,
     left_out={
@@ -155,41 +156,10 @@ class TestEmulatedUr5e(
 ):
     """The driver and ur_rtde against the emulator, in real time."""
 
-    model = "ur5e"
-
     @pytest.fixture
     def bench(self, ur: Ur) -> Iterator[RobotBench]:
         with ur.arm() as bench:
             yield bench
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-class TestEmulatedUr10e(
-    RobotContract,
-    left_out=dict.fromkeys(("lose", "restore", "fail", "freeze", "torque"), "the same for every model of the driver"),
-):
-    """Another arm of the same driver."""
-
-    model = "ur10e"
-
-    @pytest.fixture
-    def bench(self, ur: Ur) -> Iterator[RobotBench]:
-        with ur.arm() as bench:
-            yield replace(bench, lose=None, restore=None, fail=None)
-
-    for _name in (
-        "modes_are_declared",
-        "read_and_write_do_not_block",
-        "close_may_be_repeated_or_come_before_open",
-        "another_thread_may_close",
-        "a_driver_that_is_not_open_raises",
-        "an_unknown_fault_to_inject_is_refused",
-        "halt_holds_and_may_be_repeated",
-        "without_new_set_points_the_arm_holds",
-    ):
-        assert hasattr(RobotContract, f"test_{_name}")
-        vars()[f"test_{_name}"] = None
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +171,7 @@ def xarm7() -> Iterator[XArm7]:
 
 
 @pytest.mark.slow
-@pytest.mark.alone  # in real time
+@pytest.mark.pair  # in real time
 class TestEmulatedXarm7(
     RobotContract,
     left_out={
@@ -254,6 +224,17 @@ class TestEmulatedRobotiq(GripperContract, left_out={"freeze": "a gripper that d
     @pytest.fixture(params=["serial", "text"])
     def bench(self, request: pytest.FixtureRequest) -> Iterator[GripperBench]:
         with robotiq_gripper(request.param) as bench:
+            yield bench
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+class TestEmulatedXarmGripper(GripperContract, left_out={"freeze": "a gripper that does not answer is lost"}):
+    """The driver and xarm-python-sdk against the emulator, in real time."""
+
+    @pytest.fixture
+    def bench(self, xarm7: XArm7) -> Iterator[GripperBench]:
+        with xarm7.gripper() as bench:
             yield bench
 
 
@@ -359,6 +340,14 @@ class TestRecordedRealSenseOnDemand(CameraContract, left_out=FILE):
 
 
 # Gamepads.
+
+
+class TestMockLeader(LeaderContract):
+    bench = bench_of(mock_leader)
+
+
+class TestFeetechLeader(LeaderContract):
+    bench = bench_of(feetech_leader)
 
 
 class TestMockPad(GamepadContract):

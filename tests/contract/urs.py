@@ -19,8 +19,8 @@ __all__ = ["Ur"]
 class Ur:
     """An emulated arm that serves many checks, each as after switching on."""
 
-    def __init__(self, robot: str) -> None:
-        self.emulator = UrEmulator(robot=robot)
+    def __init__(self) -> None:
+        self.emulator = UrEmulator()
         # A quarter of the controller's rate: three calls to another process in each cycle take their time.
         self.spec = replace(load(self.emulator.rig()).resolve().robots[0], rate_hz=125.0)
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from hal.config import load
-from hal.testing import RobotBench
+from hal.testing import GripperBench, RobotBench
 
 from ..wire.xarm_kit import XArmEmulator
 
@@ -38,6 +38,31 @@ class XArm7:
                 lose=lambda: control.send("cut 1000") and None,
                 restore=lambda: control.send("cut 0") and None,
                 fail=self._collide,
+            )
+        finally:
+            control.send("refresh")
+            driver.close()
+
+    @contextmanager
+    def gripper(self) -> Iterator[GripperBench]:
+        """The driver of its gripper."""
+        from hal.drivers.xarm.gripper import XArmGripper
+
+        rig, control = self.emulator.rig(), self.emulator.control
+        rig["robots"]["arm"]["gripper"] = {"model": "xarm_gripper"}
+        spec = load(rig).resolve().robots[0].gripper
+        assert spec is not None
+        control.send("refresh")
+        driver = XArmGripper(spec)
+        try:
+            yield GripperBench(
+                driver=driver,
+                dt=0.01,
+                real_time=True,
+                patience=2.0,
+                lose=lambda: control.send("cut 1000") and None,
+                restore=lambda: control.send("cut 0") and None,
+                put_object=lambda width: control.send(f"object {width}") and None,
             )
         finally:
             control.send("refresh")

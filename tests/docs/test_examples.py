@@ -79,7 +79,7 @@ def test_the_unit_tests_with_the_mock_pass(tmp_path: Path) -> None:
     assert "3 passed" in done.stdout, done.stdout
 
 
-@pytest.mark.alone
+@pytest.mark.pair
 def test_the_driver_to_copy_passes_its_tests_outside_and_is_found_by_name_once_installed(tmp_path: Path) -> None:
     """``tcp_arm.py`` with ``fake_arm.py`` and ``test_tcp_arm.py``: first as a folder, then as a package."""
     folder = tmp_path / "tcp_arm"

@@ -49,6 +49,7 @@ class FakeNode:
         self.speaks = True
         """Whether it reports its state as soon as it is opened."""
         self.open_ends = 0
+        self.grabbed = False
         self._claimed, self._refused = False, 0
         self._waiting: list[Event] = []
         self._ends = socket.socketpair()
@@ -80,6 +81,9 @@ class FakeNode:
         free, self._claimed = not self._claimed, True
         self._refused += not free
         return free
+
+    def grab(self) -> None:
+        self.grabbed = True
 
     def fileno(self) -> int:
         return self._reader
@@ -125,10 +129,17 @@ class FakeInput:
         return self.put(node, identity, uniq=uniq, pad=pad)
 
     def put(
-        self, node: FakeNode, identity: Identity, *, uniq: str = "aa:bb", pad: bool = True, joystick: bool = False
+        self,
+        node: FakeNode,
+        identity: Identity,
+        *,
+        uniq: str = "aa:bb",
+        pad: bool = True,
+        joystick: bool = False,
+        keyboard: bool = False,
     ) -> FakeNode:
         """Plug in a device that the test made."""
-        self.plugged[node.path] = NodeInfo(node.path, identity, uniq, f"/sys/{uniq}", pad, joystick), node
+        self.plugged[node.path] = NodeInfo(node.path, identity, uniq, f"/sys/{uniq}", pad, joystick, keyboard), node
         self.made.append(node)
         self.changes += 1
         return node

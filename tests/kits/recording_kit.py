@@ -26,12 +26,9 @@ from hal.rig import Rig
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
-import pyarrow.parquet as pq
 from recording_layout import check_layout, check_stamps
 
 from hal.recording import Dataset, Episode, Recorder
-from hal.recording.changing import EpisodeChange, change_episodes
-from hal.recording.layout import DatasetLayout
 
 __all__ = [
     "CAMERAS",
@@ -47,7 +44,6 @@ __all__ = [
     "drive",
     "join_metadata",
     "kill_writer",
-    "make_grasps_old",
     "make_recording",
     "mock_rig",
     "pictures",
@@ -164,29 +160,6 @@ def join_metadata(root: Path) -> None:
         path.write_text(json.dumps(common | about))
     for path in root.glob("episodes/common-*.json"):
         path.unlink()
-
-
-def make_grasps_old(root: Path, width: float) -> None:
-    """Record grasps as the width of the object, and no force of a gripper, as earlier versions did."""
-    layout = DatasetLayout(root)
-    changes = {}
-    for episode in Dataset(root).episodes:
-        columns = {key: episode.columns[key].copy() for key in ("rig.setpoint", "action")}
-        for values in columns.values():
-            values[values[:, -1] == 0.0, -1] = width
-        changes[episode.number] = EpisodeChange({}, columns)
-    change_episodes(layout, changes)
-    key = "rig.setpoint_force"
-    for path in (layout.info, *layout.commons()):
-        about = json.loads(path.read_text())
-        del about["features"][key]
-        path.write_text(json.dumps(about))
-    stats = json.loads(layout.stats.read_text())
-    del stats[key]
-    layout.stats.write_text(json.dumps(stats))
-    for path in (*root.glob("data/*/*.parquet"), *root.glob("meta/episodes/*/*.parquet")):
-        table = pq.read_table(path)
-        pq.write_table(table.drop([name for name in table.column_names if key in name.split("/")]), path)
 
 
 def pictures(dataset: Dataset, what: str, camera: str) -> list[np.ndarray[Any, Any]]:

@@ -13,13 +13,15 @@ from tempfile import gettempdir
 from typing import Any
 from unittest.mock import patch
 
+from hal.config import load
 from hal.drivers.servo_bus import bus
+from hal.drivers.servo_bus.leader import FeetechLeader
 from hal.specs import RobotSpec
 from hal_emulators.control import EmulatorControl
 from hal_emulators.servo_bus import servo
 from hal_emulators.servo_bus.server import ServoBusEmulator, find_arms
 
-__all__ = ["ServoBusProcess", "SteppedServos", "servo_bus_overrides"]
+__all__ = ["ServoBusProcess", "SteppedServos", "servo_bus_overrides", "so101_leader"]
 
 _numbers = itertools.count(1)
 
@@ -62,6 +64,12 @@ class SteppedServos(ServoBusEmulator):
         super().__exit__()
         for part in self._patience:
             part.stop()
+
+
+def so101_leader(emulator: SteppedServos) -> FeetechLeader:
+    """Return the driver of a leader whose motors are those of an emulated arm."""
+    rig = {"leaders": {"lead": {"model": "so101_leader", "port": emulator.arm.port}}}
+    return FeetechLeader(load(rig).resolve().pads[0])
 
 
 class ServoBusProcess:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +10,7 @@ from urllib.parse import urlsplit
 import msgspec
 import viser
 import zstandard
-from websockets.sync.client import connect
+from websockets.sync.client import connect, unix_connect
 
 
 def until(condition: Callable[[], Any], limit: float = 20.0) -> Any:
@@ -23,36 +22,18 @@ def until(condition: Callable[[], Any], limit: float = 20.0) -> Any:
     return value
 
 
-def get(link: str, **headers: str) -> tuple[int, str]:
-    """Return the status of a GET request, and its cookie."""
-    parts = urlsplit(link)
-    connection = http.client.HTTPConnection(parts.netloc, timeout=10.0)
-    try:
-        connection.request("GET", f"{parts.path or '/'}?{parts.query}", headers=headers)
-        answer = connection.getresponse()
-        return answer.status, (answer.getheader("Set-Cookie") or "").split(";")[0]
-    finally:
-        connection.close()
-
-
 class PlainPage:
-    """Opens a link as a browser does, and keeps the received state."""
+    """Says what a browser says that shows the 3D view, and keeps the received state."""
 
-    def __init__(self, link: str) -> None:
-        status, cookie = get(link)
-        assert status == 200
-        self.address = urlsplit(link).netloc
-        self.socket = connect(
-            f"ws://{self.address}",
-            subprotocols=[f"viser-v{viser.__version__}"],
-            additional_headers={"Cookie": cookie},
-            origin=f"http://{self.address}",
-            max_size=None,
-            compression=None,
-        )
+    def __init__(self, address: str, link: str = "") -> None:
+        """Connect to the view's own socket at ``address``; with a ``link`` through the console that serves there."""
+        options: dict[str, Any] = {"subprotocols": [f"viser-v{viser.__version__}"], "max_size": None}
+        if link:
+            self.socket = connect(f"ws://{urlsplit(link).netloc}{address}", origin=link.partition("/#")[0], **options)
+        else:
+            self.socket = unix_connect(address, "ws://viser/", **options)
         self.nodes: dict[str, dict[str, Any]] = {}
         """Newest ``position`` and ``wxyz`` of each node, by name."""
-        self.texts: dict[str, str] = {}
         self.buttons: dict[str, str] = {}
         self.say(
             "ViewerCameraMessage",
@@ -102,12 +83,8 @@ class PlainPage:
             self.nodes.setdefault(name, {})["position"] = message["position"]
         elif kind == "SetOrientationMessage":
             self.nodes.setdefault(name, {})["wxyz"] = message["wxyz"]
-        elif kind == "GuiMarkdownMessage":
-            self.texts[message["uuid"]] = message["props"]["_markdown"]
         elif kind == "GuiButtonMessage":
             self.buttons[message["props"]["label"]] = message["uuid"]
-        elif kind == "GuiUpdateMessage" and message["uuid"] in self.texts:
-            self.texts[message["uuid"]] = message["updates"].get("_markdown", self.texts[message["uuid"]])
 
     def close(self) -> None:
         """Close the connection."""

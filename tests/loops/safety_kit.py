@@ -24,6 +24,9 @@ BROWSER, SYSTEM, WIRE = "tests/browser/test_", "tests/system/test_", "tests/wire
 CAN, ARMS = "tests/lock_step/test_can_faults.py::test_", "tests/unit/core/test_session_arms.py::test_"
 ELSEWHERE = {
     "the console's browser freezes": (f"{BROWSER}trips.py", f"{BROWSER}pages.py"),
+    "a [leader arm](leaders.md) is unplugged": (
+        "tests/unit/core/test_leader.py::test_a_leader_that_is_lost_while_the_pad_is_held_stops_the_arm_within_150_ms",
+    ),
     "another arm of the same `hal teleop`": (
         f"{ARMS}a_trip_of_one_arm_holds_the_other_until_a_new_press_of_its_own",
         f"{ARMS}independent_arms_do_not_stop_each_other",

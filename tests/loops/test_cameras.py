@@ -52,7 +52,7 @@ def record(folder: Path, out: str, sim: bool | None) -> Episode:
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.pair
 def test_a_program_records_a_video_camera_and_with_sim_a_simulated_one(tmp_path: Path) -> None:
     write_video(tmp_path / "video.mkv", FRAMES, rate=RATE)
     episode = record(tmp_path, "real", None)

@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[2]
 
 def in_real_time(test: Any) -> Any:
     """Mark a test of what a busy computer would stop."""
-    return pytest.mark.slow(pytest.mark.alone(test))
+    return pytest.mark.slow(pytest.mark.pair(test))
 
 
 def test_every_row_has_a_test_and_every_test_a_row() -> None:

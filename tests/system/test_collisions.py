@@ -7,7 +7,7 @@ import pytest
 
 import hal
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.pair
 
 
 def test_two_arms_of_two_processes_stop_apart() -> None:

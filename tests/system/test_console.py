@@ -119,7 +119,7 @@ def test_a_console_that_is_stopped_does_not_hold_up_the_end(rig: hal.Rig) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.pair
 async def test_a_stop_ends_the_tour_for_good(rig: hal.Rig) -> None:
     arm, pad = rig.robots["panda"], rig.gamepads["pad"]
     teleop = hal.Teleop(arm)

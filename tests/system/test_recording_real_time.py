@@ -12,7 +12,7 @@ import hal
 from hal.recording import Dataset, Recorder
 from hal.types import RobotState
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 SECONDS = 4.0
 

@@ -22,7 +22,7 @@ from hal.recording import Dataset, Recorder, recover
 from hal.rig import Rig
 from hal.types import Frame, RobotStatus, Trip
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 
 class Driver:

@@ -12,7 +12,7 @@ from can_proofs import end, rest, tour
 
 from .calm_tour import Held, write_pad
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.pair
 
 DRIVE: tuple[Held, ...] = (
     (0.6, 1.6, "ABS_HAT0Y", -1, 0),  # forwards

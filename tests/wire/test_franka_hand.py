@@ -26,7 +26,7 @@ from hal.types import GripperOutcome
 from .franka_kit import free_host
 from .hand_kit import LIMIT, HandBench
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.pair
 
 DONE, MISSED, STOPPED, FAILED = (GripperOutcome[name] for name in ("DONE", "MISSED", "STOPPED", "FAILED"))
 

@@ -92,6 +92,7 @@ def grasp_cube(config: Path, sim: bool) -> tuple[bool, float, float]:
     """Grasp the cube; return whether it is held, the width of the fingers and how far it is lifted, m."""
     with hal.open(config, sim=sim, pad="none", clock="lock_step" if sim else "real_time") as rig:
         arm = rig.robots["arm"]
+        rig.cameras["scene"].read(timeout=10.0)  # meshes that are new take the renderer long beside five processes
         assert arm.gripper is not None
         if not sim:
             arm.gripper.home()

@@ -58,7 +58,7 @@ def test_an_independent_client_activates_and_moves_the_emulated_gripper() -> Non
         assert far.run(0.05).width == pytest.approx(0.03, abs=1e-3)
 
 
-@pytest.mark.alone
+@pytest.mark.pair
 @LINES
 @pytest.mark.parametrize("fault", ["unplug on", "silent on", "power on", "late 0.5", "lose 1"])
 def test_a_line_that_is_gone_is_known_soon_and_comes_back(line: str, fault: str) -> None:

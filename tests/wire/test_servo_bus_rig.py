@@ -18,7 +18,7 @@ from waiting import wait_until
 import hal
 from hal.errors import ControlTaken, HalError
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 POSES = {
     "so101": ([0.3, -0.4, 0.6, 1.0, -1.2], [-0.4, -0.9, 1.1, 1.3, -1.5], [0.0, -0.6, 0.87, 1.3, -1.524]),

@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
 CUBE = "{name: cube, shape: box, half_extents: [0.025, 0.025, 0.025], mass: 0.2, rgba: [0.85, 0.2, 0.2, 1.0]}"
 VIEW = "look_at: {target: [-0.1, 0, 0.7], distance: 0.85, yaw_deg: 60, pitch_deg: -30}"
 CAMERA = f"{{sim: true, model: pinhole, streams: [color, depth], output: {{width: 256, height: 256}}, {VIEW}}}"
-STEPS, FEW = 100, 50
+STEPS, FEW = 100, 20
 
 
 @pytest.fixture(scope="module")

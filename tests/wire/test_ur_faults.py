@@ -14,21 +14,28 @@ from hal_emulators.control import EmulatorControl
 
 from .ur_kit import UrEmulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 NAMED_WITHIN = 0.150
 FAULTS = {
     "PROTECTIVE_STOP": ("protective", ""),
+    "PROTECTIVE_STOP after a jump": ("jump 0.5", ""),
     "EMERGENCY_STOP": ("estop on", "estop off"),
+    "EMERGENCY_STOP of the system": ("safety 6", "safety 1"),
+    "RECOVERY_MODE": ("safety 4", "safety 1"),
+    "SAFETY_VIOLATION": ("safety 8", "safety 1"),
+    "SAFETY_FAULT": ("safety 9", "safety 1"),
     "SAFEGUARD_STOP": ("safeguard on", "safeguard off"),
     "NOT_RUNNING": ("power off", "power on"),
     "LOCAL_CONTROL": ("remote off", "remote on"),
     "PROGRAM_STOPPED": ("program", ""),
+    "PROGRAM_STOPPED by a pause": ("pause on", ""),
     "PROGRAM_STOPPED by another program": ("program thief", "program"),
     "SPEED_SLIDER": ("slider 0.5", "slider 1"),
     "SPEED_SCALED": ("limit 0.5", "limit 1"),
     "SILENT": ("silence 0.6", ""),
     "SILENT without a connection": ("cut 0.6", ""),
+    "SILENT as states are lost": ("lose 1", "lose 0"),
     "SILENT until late states come": ("late 0.4", "late 0"),
 }
 """Code, and what it is -> what causes it, and what ends that."""
@@ -101,7 +108,7 @@ def test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover(
     emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 0.5)
     if end:
         emulator.control.send(end)
-    if name == "EMERGENCY_STOP":
+    if code in ("EMERGENCY_STOP", "SAFETY_VIOLATION"):
         emulator.control.send("power on")
     recover(rig, arm)
     assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
@@ -178,7 +185,7 @@ def test_a_program_that_was_being_started_as_the_connection_was_lost_is_ended() 
             other.wait_for(lambda status: status["program"] == "rtde_control")
             link.lose()
             other.wait_for(lambda status: not status["program"])
-            assert not link.running
+            assert not link.ready
             link.close()
             link.open()
             assert not link.starting

@@ -26,7 +26,7 @@ from hal_emulators.ur.motion import forward
 from .test_ur_faults import recover, wait_code
 from .ur_kit import UrEmulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 STOPS_WITHIN = 0.150
 """From the end of the host's messages to the end of the program, s."""

@@ -15,12 +15,16 @@ import hal
 from .test_ur_faults import find_code, recover, wait_code
 from .xarm_kit import XArmEmulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 NAMED_WITHIN = 0.150
 FAULTS = {
     "C31": ("error 31", ""),
     "C24": ("error 24", ""),
+    "C24 after a jump": ("jump 0.3", ""),
+    "C22": ("error 22", ""),
+    "C60": ("error 60", ""),
+    "C2": ("error 2", ""),
     "C35": ("error 35", ""),
     "C12": ("error 12", ""),
     "C77 that nobody knows": ("error 77", ""),
@@ -31,7 +35,10 @@ FAULTS = {
     "OTHER_MODE": ("mode 0", ""),
     "OTHER_MODE by hand": ("mode 2", "mode 0"),
     "SILENT": ("silence 0.6", ""),
+    "SILENT to commands": ("mute 0.6", ""),
     "SILENT without a connection": ("cut 0.6", ""),
+    "SILENT as reports are lost": ("lose 1", "lose 0"),
+    "SILENT until late reports come": ("late 0.4", "late 0"),
 }
 """Code, and what it is -> what causes it, and what ends that."""
 
@@ -81,7 +88,7 @@ def test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover(
 
 
 def test_an_answer_that_is_late_stops_the_arm_and_no_set_point_jumps(rig: hal.Rig, emulator: XArmEmulator) -> None:
-    """A network that loses a packet sends it again after 0.2 s: the arm stands meanwhile, and goes on."""
+    """The arm stands meanwhile, and goes on."""
     arm = rig.robots["arm"]
     arm.move_to(arm.home, unattended=True, speed=0.3)
     with arm.control(rate_hz=50, unattended=True) as control:
@@ -89,7 +96,7 @@ def test_an_answer_that_is_late_stops_the_arm_and_no_set_point_jumps(rig: hal.Ri
         for tick in rig.clock.rate(50):
             control.send(hal.JointVelocity([0, 0, 0, 0, 0, 0, 0.9]))
             if not muted and max(emulator.status()["dq"]) > 0.7:
-                emulator.control.send("mute 0.19")
+                emulator.control.send("mute 0.08")
                 muted = tick.elapsed
             if muted and tick.elapsed > muted + 0.8:
                 break
@@ -126,11 +133,6 @@ def test_an_arm_that_is_held_back_is_stopped(rig: hal.Rig, emulator: XArmEmulato
     time.sleep(0.2)
     assert emulator.status()["q"] == pytest.approx(stopped["q"], abs=1e-3), "nothing moves once it is free"
     recover(rig, arm)
-
-
-def test_a_controller_that_answers_no_commands_is_lost(rig: hal.Rig, emulator: XArmEmulator) -> None:
-    drive(rig, emulator, "mute 1.5", "SILENT")
-    recover(rig, rig.robots["arm"])
 
 
 def test_positions_that_are_no_numbers_stop_the_arm(rig: hal.Rig, emulator: XArmEmulator) -> None:

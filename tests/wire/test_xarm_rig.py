@@ -9,19 +9,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 import hal
 
-from .test_ur_faults import recover
+from .test_ur_faults import recover, wait_code
 from .test_ur_rig import find_children
 from .xarm_kit import XArmEmulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 APP = """
 import sys, hal, json
@@ -55,6 +57,7 @@ def test_a_program_of_its_own_moves_the_arm_with_the_sdk(emulator: XArmEmulator)
     assert done["clean"] == [0, 0, 0, 0, 0, 2, 0]
     assert done["report"] == [1, 0, [1] * 7]
     assert done["load"] == 0
+    assert done["gripper"] == [0, 0, 400, 0, "3.4.3"]
 
 
 def drive(rig: hal.Rig, emulator: XArmEmulator, act: Any) -> None:
@@ -135,6 +138,34 @@ def test_the_same_program_ends_at_the_same_poses_on_the_arm_and_in_simulation(em
     print(f"{1e3 * apart:.3f} mm, {off:.5f} rad")
     assert off < 0.003
     assert apart < 0.001
+
+
+def test_the_gripper_holds_names_its_faults_and_moves_again(emulator: XArmEmulator) -> None:
+    rig, control = emulator.rig(), emulator.control
+    rig["robots"]["arm"]["gripper"] = {"model": "xarm_gripper"}
+    with hal.open(rig) as opened:
+        arm = opened.robots["arm"]
+        gripper = arm.gripper
+        assert gripper is not None
+        control.send("object 0.03")
+        assert gripper.grasp(0.03)
+        control.send("object none")
+        assert gripper.move(0.05).width == pytest.approx(0.05, abs=2e-3)
+        control.send("gripper block")
+        with pytest.raises(hal.RobotFault, match="Position Deviation") as failed:
+            gripper.move(0.0)
+        assert "gripper.home()" in failed.value.remedy
+        control.send("gripper on")
+        gripper.home()
+        assert gripper.move(0.07).width == pytest.approx(0.07, abs=2e-3)
+        control.send("gripper off")
+        with pytest.raises(hal.ConnectionLost, match="does not answer through the control box"):
+            wait_until(lambda: gripper.state() is None, "it is named")
+        wait_code(arm, "C19")
+        control.send("gripper on")
+        recover(opened, arm)
+        wait_until(lambda: gripper.state(max_age=inf).fault is None, "it answers again")
+        assert gripper.move(0.02).width == pytest.approx(0.02, abs=2e-3)
 
 
 def test_a_model_of_another_arm_is_refused() -> None:

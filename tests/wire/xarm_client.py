@@ -40,6 +40,8 @@ done["clean"] = [arm.clean_error(), arm.get_err_warn_code()[1][0], *start(1), ar
 time.sleep(0.5)  # a report of port 30002
 done["report"] = [arm.mode, arm.error_code, arm.motor_enable_states[:7]]
 done["load"] = arm.set_tcp_load(0.8, [0, 0, 50])
+done["gripper"] = [arm.set_gripper_position(400, wait=True, speed=5000, auto_enable=True), *arm.get_gripper_position()]
+done["gripper"] += [arm.get_gripper_err_code()[1], arm.get_gripper_version()[1]]
 arm.disconnect()
 print(json.dumps(done), flush=True)
 os._exit(0)

@@ -1,13 +1,18 @@
 // The panel of an arm: joints, tool, gripper, timing of its servo, and the age of all that.
 
-import { byId, choose, make, segments, setData, setText } from "./dom.js";
+import { byId, choose, make, remember, remembered, segments, setAttribute, setData, setText } from "./dom.js";
 import { Plot, shortened, signed } from "./plot.js";
 
-/** The bar of one joint: measured and target position between its limits. */
+/** Unit of joints -> its share of a radian, and digits. @type {Record<string, [number, number]>} */
+const UNITS = { rad: [1, 3], deg: [180 / Math.PI, 1] };
+
+/** The bar of one joint: measured and target position between its limits; a bar is as long as the joint's range. */
 class JointBar {
-  /** @param {string} name @param {number} lower @param {number} upper @param {() => void} clicked */
-  constructor(name, lower, upper, clicked) {
+  /** @param {string} name @param {number} lower @param {number} upper @param {number[]} scale the ends of all bars
+   *  @param {() => void} clicked */
+  constructor(name, lower, upper, [first, last], clicked) {
     this.lower = lower;
+    this.upper = upper;
     this.span = upper - lower || 1;
     this.element = make("li");
     const button = make("button");
@@ -18,17 +23,25 @@ class JointBar {
     this.value = make("span", "value");
     const track = make("span", "track");
     track.append(this.measured, this.target);
-    button.append(make("span", "name", name), track, this.value);
-    button.title = `${name}: ${lower.toFixed(3)} to ${upper.toFixed(3)} rad`;
+    const share = (/** @type {number} */ value) => `${(100 * value) / (last - first || 1)}%`;
+    Object.assign(track.style, { marginLeft: share(lower - first), width: share(this.span) });
+    track.style.setProperty("--zero", `${(-100 * lower) / this.span}%`);
+    const scale = make("span");
+    scale.append(track);
+    button.append(make("span", "name", name), scale, this.value);
+    this.name = name;
     this.element.append(button);
     this.button = button;
   }
 
-  /** @param {number} q @param {number} set */
-  show(q, set) {
+  /** @param {number} q @param {number} set @param {string} unit */
+  show(q, set, unit) {
+    const [scale, digits] = UNITS[unit];
     this.#move(this.measured, q);
     this.#move(this.target, set);
-    setText(this.value, signed(q, 3));
+    setText(this.value, signed(scale * q, digits));
+    const [lower, upper] = [this.lower, this.upper].map((limit) => (scale * limit).toFixed(digits));
+    setAttribute(this.button, "title", `${this.name}: limits ${lower} to ${upper} ${unit}. Click to plot it alone.`);
     const share = (q - this.lower) / this.span;
     setData(this.element, "near", share < 0.03 || share > 0.97 ? "" : null);
   }
@@ -56,8 +69,10 @@ class Joints {
 
   /** Lay out the bars of an arm. @param {any} robot of hello */
   open(robot) {
+    const scale = [Math.min(...robot.lower), Math.max(...robot.upper)];
     this.rows = robot.joints.map((/** @type {string} */ name, /** @type {number} */ k) => {
-      return new JointBar(shortened(name, robot.joints), robot.lower[k], robot.upper[k], () => this.#choose(k));
+      const [lower, upper, short] = [robot.lower[k], robot.upper[k], shortened(name, robot.joints)];
+      return new JointBar(short, lower, upper, scale, () => this.#choose(k));
     });
     this.rows.forEach((row, k) => (row.button.dataset.joint = String(k)));
     byId("joints").replaceChildren(...this.rows.map((row) => row.element));
@@ -65,9 +80,9 @@ class Joints {
     this.#mark();
   }
 
-  /** @param {any} robot of a state */
-  show(robot) {
-    this.rows.forEach((row, k) => row.show(robot.q[k], robot.q_set[k]));
+  /** @param {any} robot of a state @param {string} unit */
+  show(robot, unit) {
+    this.rows.forEach((row, k) => row.show(robot.q[k], robot.q_set[k], unit));
   }
 
   /** @param {number} joint */
@@ -82,6 +97,7 @@ class Joints {
   }
 }
 
+const UNIT_KEY = "hal-console-unit";
 const WINDOW = 2; // s over which the servo's rate is counted
 const OLD = 500; // ms
 
@@ -114,10 +130,20 @@ export class ArmPanel {
     this.measured = new Map();
     /** Called with the name of an arm that was clicked. @type {(name: string) => void} */
     this.picked = () => {};
+    segments(byId("unit"), Object.keys(UNITS), (unit) => this.#measure(unit));
+    this.#measure(remembered(UNIT_KEY) ?? "");
   }
 
   /** Least and greatest width of the gripper, m. */
   #widths = /** @type {[number, number] | null} */ (null);
+
+  /** Show joints in a unit. @param {string} unit */
+  #measure(unit) {
+    this.unit = unit in UNITS ? unit : "rad";
+    remember(UNIT_KEY, this.unit);
+    choose(byId("unit"), this.unit);
+    [this.plot.scale, this.plot.digits] = UNITS[this.unit];
+  }
 
   /** @param {any[]} robots of hello */
   open(robots) {
@@ -167,7 +193,7 @@ export class ArmPanel {
     const there = robot && !robot.lost;
     setData(byId("facts"), "old", there && silent < OLD ? null : "");
     if (there) {
-      this.joints.show(robot);
+      this.joints.show(robot, this.unit);
       const [x, y, z, ...turn] = robot.tcp;
       setText(byId("tcp"), `x ${signed(x, 3)}  y ${signed(y, 3)}  z ${signed(z, 3)} m`);
       const [roll, pitch, yaw] = angles(turn).map((angle) => signed(angle, 1));

@@ -1,4 +1,4 @@
-// The pictures of the cameras: the socket that brings them, and the panel with one large and the others small.
+// What is seen: the 3D view, the pictures of the cameras and the socket that brings them, one large and the others small.
 
 import { socketTo, tokenOfPage } from "./connection.js";
 import { byId, choose, make, segments, setData, setText, show } from "./dom.js";
@@ -163,7 +163,39 @@ class View {
   }
 }
 
-/** The panel of all cameras. */
+/** Whether this browser can draw in 3D. @param {object} [wishes] */
+const draws3D = (wishes) => Boolean(document.createElement("canvas").getContext("webgl2", wishes));
+
+/** The 3D view, of the rig's own program (drivers/viser). It takes any shape, and opens when it is enlarged. */
+class Stage {
+  /** @param {string} address path on this server @param {(name: string) => void} choose */
+  constructor(address, choose) {
+    this.name = "3D";
+    this.shape = 0;
+    this.visible = false;
+    this.figure = make("figure", "camera stage");
+    /** Whether the processor would have to draw it: then only a click opens it, for it may starve this page. */
+    this.slow = !draws3D({ failIfMajorPerformanceCaveat: true });
+    this.figure.classList.toggle("slow", this.slow);
+    const frame = make("iframe");
+    this.open = () => frame.src || (frame.src = `${address}/`);
+    frame.title = "3D view: drag the gizmo on the tool, and the arm moves to it while the dead-man is held";
+    frame.tabIndex = -1;
+    // The keys stay with this page: a press does not move the focus, and what gets it all the same gives it back.
+    frame.addEventListener("load", () => {
+      frame.contentDocument?.addEventListener("mousedown", (/** @type {Event} */ event) => event.preventDefault(), true);
+    });
+    addEventListener("blur", () => setTimeout(() => document.activeElement === frame && (frame.blur(), focus())));
+    const caption = make("figcaption");
+    caption.append(make("b", "", this.slow ? "3D (no GPU: slow)" : "3D"));
+    this.figure.append(frame, caption);
+    this.figure.addEventListener("click", () => choose(this.name)); // while it is small: its frame takes no pointer then
+  }
+
+  mark() {}
+}
+
+/** The panel of the 3D view and of all cameras. */
 export class Cameras {
   constructor() {
     this.pictures = new Pictures();
@@ -171,19 +203,26 @@ export class Cameras {
     this.pictures.came = (picture) => this.views[picture.camera]?.draw(picture);
     /** @type {View[]} */
     this.views = [];
+    /** The views, with the 3D view before them if there is one. @type {(View | Stage)[]} */
+    this.shown = [];
+    /** @type {Stage | null} */
+    this.stage = null;
     this.large = "";
     this.seen = new IntersectionObserver((entries) => this.#moved(entries));
     document.addEventListener("visibilitychange", () => this.#watch());
     new ResizeObserver(() => this.#place()).observe(byId("cameras"));
   }
 
-  /** Lay out the panel and connect. @param {any[]} cameras of hello */
-  open(cameras) {
+  /** Lay out the panel and connect. @param {any[]} cameras of hello @param {string} stage path of the 3D view, or "" */
+  open(cameras, stage) {
     const names = cameras.map((camera) => camera.name);
-    const same = names.join("\n") === this.views.map((view) => view.name).join("\n");
-    if (!same || !names.length) this.#build(cameras, names);
+    const all = [stage, ...names].join("\n");
+    if (this.#built !== all) this.#build(cameras, draws3D() ? stage : "");
+    this.#built = all;
     this.pictures.open(names);
   }
+
+  #built = "?";
 
   close() {
     this.pictures.close();
@@ -195,15 +234,18 @@ export class Cameras {
     for (const view of this.views) if (view.visible) view.mark(now);
   }
 
-  /** @param {any[]} cameras @param {string[]} names */
-  #build(cameras, names) {
+  /** @param {any[]} cameras @param {string} stage */
+  #build(cameras, stage) {
     this.seen.disconnect();
-    this.views = cameras.map((camera) => new View(camera, (name) => this.#enlarge(name)));
-    byId("cameras").replaceChildren(...this.views.map((view) => view.figure));
-    segments(byId("tabs"), names, (name) => this.#enlarge(name));
-    if (names.length) this.#enlarge(names[0]);
+    const enlarge = (/** @type {string} */ name) => this.#enlarge(name);
+    this.views = cameras.map((camera) => new View(camera, enlarge));
+    this.stage = stage ? new Stage(stage, enlarge) : null;
+    this.shown = this.stage ? [this.stage, ...this.views] : this.views;
+    byId("cameras").replaceChildren(...this.shown.map((view) => view.figure));
+    const names = this.shown.map((view) => view.name);
+    segments(byId("tabs"), names, enlarge);
+    if (names.length) enlarge(names[this.stage?.slow && this.views.length ? 1 : 0]);
     else byId("cameras").append(make("p", "hint", "This rig has no cameras."));
-    setData(byId("view"), "count", String(names.length));
     for (const view of this.views) this.seen.observe(view.figure);
     show(byId("tabs"), names.length > 1);
   }
@@ -211,7 +253,8 @@ export class Cameras {
   /** @param {string} name */
   #enlarge(name) {
     this.large = name;
-    for (const view of this.views) view.figure.classList.toggle("large", view.name === name);
+    if (name === this.stage?.name) this.stage.open();
+    for (const view of this.shown) view.figure.classList.toggle("large", view.name === name);
     choose(byId("tabs"), name);
     this.#place();
   }
@@ -219,11 +262,13 @@ export class Cameras {
   /** Fill the panel: the other pictures below the large one or beside it, whichever shows them larger. */
   #place() {
     const { clientWidth: width, clientHeight: height } = byId("cameras");
-    const large = this.views.find((view) => view.name === this.large);
+    const large = this.shown.find((view) => view.name === this.large);
     if (!large || !width || !height) return;
-    const others = this.views.filter((view) => view !== large && getComputedStyle(view.figure).display !== "none");
-    const below = stacked(width, height, large, others, (view) => view.shape);
-    const beside = stacked(height, width, large, others, (view) => 1 / view.shape).map(turned);
+    const others = this.shown.filter((view) => view !== large && getComputedStyle(view.figure).display !== "none");
+    const share = others.length ? MOST : 1;
+    const shapeOf = (/** @type {View | Stage} */ view) => view.shape || (view === large ? width / (share * height) : 4 / 3);
+    const below = stacked(width, height, large, others, shapeOf);
+    const beside = stacked(height, width, large, others, (view) => 1 / shapeOf(view)).map(turned);
     const area = (/** @type {number[][]} */ boxes) => boxes.reduce((sum, [, , w, h]) => sum + w * h, 0);
     const boxes = area(below) >= area(beside) ? below : beside;
     [large, ...others].forEach(({ figure }, k) => {
@@ -255,8 +300,8 @@ const turned = ([left, top, width, height]) => [top, left, height, width];
 
 /**
  * Boxes (left, top, width, height) of a large picture and of a row of others below it.
- * @param {number} width @param {number} height @param {View} large @param {View[]} others
- * @param {(view: View) => number} shapeOf width by height
+ * @param {number} width @param {number} height @param {View | Stage} large @param {(View | Stage)[]} others
+ * @param {(view: View | Stage) => number} shapeOf width by height
  */
 function stacked(width, height, large, others, shapeOf) {
   const room = others.length ? MOST * height : height;

@@ -142,19 +142,19 @@ export function onTap(element, act) {
 
 const KEY = "hal-console-theme";
 
-/** Return the theme that was chosen on this browser. @returns {string | null} */
-function remembered() {
+/** Return what was chosen on this browser. @param {string} key @returns {string | null} */
+export function remembered(key) {
   try {
-    return localStorage.getItem(KEY);
+    return localStorage.getItem(key);
   } catch {
     return null; // a browser may forbid it
   }
 }
 
-/** Keep the theme for the next time. @param {string} theme */
-function remember(theme) {
+/** Keep a choice for the next time. @param {string} key @param {string} value */
+export function remember(key, value) {
   try {
-    localStorage.setItem(KEY, theme);
+    localStorage.setItem(key, value);
   } catch {
     // Then it lasts as long as the page is open.
   }
@@ -163,7 +163,7 @@ function remember(theme) {
 /** Follow the system's theme until the button is pressed. @param {() => void} changed called at every change */
 export function openTheme(changed) {
   const root = document.documentElement;
-  const known = remembered();
+  const known = remembered(KEY);
   if (known === "light" || known === "dark") {
     root.dataset.theme = known;
     changed(); // what was drawn before has the other theme's colours
@@ -172,7 +172,7 @@ export function openTheme(changed) {
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
     const now = root.dataset.theme ?? (dark ? "dark" : "light");
     root.dataset.theme = now === "dark" ? "light" : "dark";
-    remember(root.dataset.theme);
+    remember(KEY, root.dataset.theme);
     changed();
   });
 }

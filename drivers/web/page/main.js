@@ -69,7 +69,7 @@ const HANDLERS = {
     recording.forget();
     panel.open(rig.robots);
     settings.open(rig);
-    cameras.open(rig.cameras);
+    cameras.open(rig.cameras, rig.stage);
     gamepad.describe();
   },
   lease(message) {

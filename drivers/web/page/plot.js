@@ -33,6 +33,8 @@ export class Plot {
     /** @type {number | null} */
     this.joint = null;
     this.visible = true;
+    /** Of the unit in which positions are shown: its share of a radian, and digits. */
+    [this.scale, this.digits] = [1, 3];
     const seen = new IntersectionObserver((entries) => (this.visible = entries[entries.length - 1].isIntersecting));
     seen.observe(this.canvas);
     new ResizeObserver(() => this.#resize()).observe(this.canvas);
@@ -149,7 +151,9 @@ export class Plot {
   #scale(middle, half, left, y) {
     const { context } = this;
     context.textAlign = "right";
-    for (const value of [middle - half, middle, middle + half]) context.fillText(signed(value, 3), left - 5, y(value));
+    for (const value of [middle - half, middle, middle + half]) {
+      context.fillText(signed(this.scale * value, this.digits), left - 5, y(value));
+    }
   }
 
   /**

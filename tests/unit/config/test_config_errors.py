@@ -53,6 +53,10 @@ def held(**keys: Any) -> dict[str, Any]:
     return camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", **keys})
 
 
+def leader(**keys: Any) -> dict[str, Any]:
+    return {"robots": {"arm": ROBOT}, "leaders": {"l": {"model": "so101_leader", "port": "/dev/a", **keys}}}
+
+
 def thing(**keys: Any) -> dict[str, Any]:
     return {"objects": [{"name": "brick", "shape": "box", "half_extents": [1, 1, 1], **keys}]}
 
@@ -153,6 +157,16 @@ def thing(**keys: Any) -> dict[str, Any]:
         ({"gamepads": {"p": {"sim": True, "file": "no.jsonl"}}}, "gamepads.p.file", "missing_file"),
         ({"gamepads": {"p": {"sim": True, "options": {"loop": True}}}}, "gamepads.p.options", "conflict"),
         ({"gamepads": {"p": {"sim": "maybe"}}}, "gamepads.p.sim", "wrong_type"),
+        # Leaders.
+        (leader(model="so101_leadr"), "leaders.l.model", "unknown_model"),
+        (leader(port=None), "leaders.l.port", "missing_key"),
+        (leader(drives="b"), "leaders.l.drives", "unknown_robot"),
+        (leader(deadman="pedal"), "leaders.l.deadman", "unknown_device"),
+        (leader(signs=[1, 1, 1]), "leaders.l.signs", "wrong_count"),
+        (leader(signs=[1, 1, 0.5, 1, 1]), "leaders.l.signs", "out_of_range"),
+        (leader(options={"ids": [1, 2]}), "leaders.l.options.ids", "wrong_count"),
+        (leader(engage="approach"), "leaders.l.engage", "conflict"),
+        (leader(driver="ur"), "leaders.l.driver", "wrong_driver"),
         # Names of devices.
         ({"robots": {"a": ROBOT}, "cameras": {"a": CAMERA}}, "cameras.a", "duplicate_name"),
     ],

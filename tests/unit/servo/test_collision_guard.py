@@ -116,6 +116,18 @@ def test_a_stream_into_the_table_stops_before_the_margin_and_can_leave(panda: Ro
     assert bench.distance() > before + 0.005
 
 
+def test_a_second_session_in_which_one_joint_moves_is_checked(panda: RobotSpec) -> None:
+    bench = Bench(panda, CollisionSpec(boxes=(TABLE,)))
+    bench.start(OVER_THE_TABLE)
+    bench.run(0.1, Kind.JOINT_VELOCITY, lambda _: [0.0] * 7)
+    bench.servo.close_session()
+    bench.servo.tick(bench.now, Reading(bench.now, bench.now, 0, OVER_THE_TABLE, [0.0] * 7), NO_INBOX)
+    bench.start(OVER_THE_TABLE)
+    bench.run(1.5, Kind.JOINT_VELOCITY, lambda _: [0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert -1e-4 < bench.nearest < 5e-3
+    assert Limited.COLLISION in bench.seen
+
+
 def test_random_streams_never_get_under_a_margin(panda: RobotSpec) -> None:
     rng = np.random.default_rng(8)
     stopped = 0

@@ -66,7 +66,8 @@ def in_motion(q: Array, dq: Array, mass: Array) -> tuple[ArmInMotion, TcpInMotio
     """Return the measured state of an arm, and of its tcp."""
     pose, jacobian = KINEMATICS.fk_and_jacobian(q)
     arm = ArmInMotion(q.tolist(), dq.tolist(), Inertia(mass, N))
-    return arm, TcpInMotion(pose, jacobian, jacobian[:3] @ dq, q, dq)
+    velocity = jacobian[:3] @ dq
+    return arm, TcpInMotion(pose, jacobian, velocity, float(np.linalg.norm(velocity)), q, dq)
 
 
 def test_joint_springs_pull_with_their_stiffness() -> None:

@@ -14,7 +14,7 @@ from hal.commands import Session
 from hal.kinematics.arm import Kinematics
 from hal.servo.envelope import Envelope
 from hal.servo.smoothing import JointSmoother
-from hal.servo.torque_bounds import RATE, ArmInMotion, Inertia, TorqueBounds
+from hal.servo.torque_bounds import RATE, ArmInMotion, Inertia, TcpInMotion, TorqueBounds
 from hal.specs import WorkspaceSpec
 from hal.types import Limited
 
@@ -193,5 +193,6 @@ def test_torques_of_a_controller_that_are_no_numbers_are_none() -> None:
     made, envelope = bounds()
     arm = ArmInMotion(HOME, STILL, Inertia(np.eye(N), N))
     tau = np.array([[math.nan, *STILL[1:]], STILL])
-    assert made.shared(tau, lambda: np.zeros(3), 0.0, arm, np.zeros(3)) == STILL
+    tcp = TcpInMotion((0.0,) * 7, np.zeros((6, N)), np.zeros(3), 0.0, np.zeros(N), np.zeros(N))
+    assert made.shared(tau, lambda: np.zeros(3), 0.0, arm, tcp) == STILL
     assert envelope.limited

@@ -58,8 +58,10 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
                 made = _emulator_of(device.driver, arm, words, in_world)
                 if made is not None:
                     emulators[made.name] = made
+    if any(pad.leader is not None and pad.driver in ("feetech", "dynamixel") for pad in rig.pads):
+        emulators["servo_bus"] = Emulator("servo_bus", ["servo_bus", *words])
     if not emulators:
-        raise ValueError(f"{config} names no real arm or gripper that has an emulator")
+        raise ValueError(f"{config} names no real arm, gripper or leader that has an emulator")
     return list(emulators.values())
 
 

@@ -23,7 +23,7 @@ DEVICES = {
     "franka": "a Franka arm and its hand",
     "ur": "a UR arm",
     "xarm": "a UFACTORY xArm",
-    "servo_bus": "every arm with Feetech or Dynamixel servos of a rig",
+    "servo_bus": "every arm and leader with Feetech or Dynamixel servos of a rig",
     "robotiq": "every Robotiq gripper of a rig",
 }
 

@@ -11,6 +11,7 @@ import pytest
 from pictures_kit import box, camera, drawn, look_at, rays, renderer
 from specs import data, panda
 
+from hal.drivers.scene.lighting import Light
 from hal.drivers.scene.meshes import MeshLibrary
 from hal.drivers.scene.renderer import RenderedImages
 from hal.drivers.scene.shapes import parts_of
@@ -113,6 +114,23 @@ def test_picture_is_upright_and_not_mirrored(name: str) -> None:
     assert below_row > 75
     assert right_column < 45  # +y is to the left of somebody who looks along +x
     assert strongest == [0, 1, 2]
+
+
+def test_a_floor_is_lit_and_gleams_by_the_formulas_of_its_light() -> None:
+    """Light from above, from the camera and from the first light, and the gloss of its reflection (Blinn, 1977)."""
+    grey, spec = 102 / 255, camera(120, 120)
+    to_light = np.array(Light().direction) / np.linalg.norm(Light().direction)
+    pose = look_at(to_light * (-1.0, -1.0, 1.0), (0.0, 0.0, 0.0))  # the reflection is in the middle
+    floor = box("floor", (4.0, 4.0, 0.05), (0.0, 0.0, -0.05), rgba=(grey, grey, grey, 1.0))
+    with picture("gl", floor, spec=spec, pose=pose) as images:
+        found = images.color
+    to_eye = -rays(spec) @ pose.matrix()[:3, :3].T
+    to_eye /= np.linalg.norm(to_eye, axis=-1, keepdims=True)
+    middle = to_eye + to_light
+    gloss = 0.05 * (middle[..., 2] / np.linalg.norm(middle, axis=-1)) ** 24
+    light = np.array([0.52, 0.54, 0.57]) + (0.12 * to_eye[..., 2] + 0.36 * to_light[2])[..., None]
+    assert np.ptp(gloss) > 0.02
+    assert np.abs(found - 255.0 * (grey * light + gloss[..., None])).max() < 1.0
 
 
 @BOTH

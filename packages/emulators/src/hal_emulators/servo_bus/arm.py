@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.drivers.servo_bus.protocol import ALL, COUNT
 from hal.drivers.servo_bus.settings import ServoArmSettings, ServoGripperSettings
@@ -75,7 +77,7 @@ class EmulatedArm:
         gripper = spec.gripper
         if gripper is not None and gripper.driver == spec.driver:
             own = ServoGripperSettings.of(gripper)
-            span = abs(gripper.opened[0] - gripper.closed[0])
+            span = abs(gripper.opened[0] - gripper.closed[0]) if own.widths is None else 0.0
             table = own.widths or [(share * span, width) for share, width in gripper.travel]
             self._ways, self._widths = [angle - table[0][0] for angle, _ in table], [width for _, width in table]
             closed = 2000 if own.widths is None else round(own.zero + table[0][0] / COUNT)
@@ -87,7 +89,48 @@ class EmulatedArm:
         self.world: ArmInWorld | None = None
         self.peak = [0.0] * len(self.joints)
         """Greatest speed of each joint since the last reset, rad/s."""
+        self._hand: deque[tuple[float, NDArray[np.float64]]] = deque()
+        """Motions that a hand still makes: duration, s, and where they end: the joints, rad, then the lever, 0 to 1."""
+        self._begun, self._t_hand = np.zeros(0), 0.0
         self.place(spec.initial)
+
+    def lead(self, seconds: float, end: Sequence[float]) -> None:
+        """Let a hand move an arm without torque, after the motions that it makes already.
+
+        Args:
+            seconds: Duration of the motion.
+            end: Where it ends: the joints, rad, and the lever from 0 (open) to 1 (closed), or only the joints.
+
+        Raises:
+            ValueError: The wrong number of values, or a motor has torque.
+        """
+        count = len(self.joints)
+        if len(end) not in (count, count + 1) or not seconds > 0.0:
+            raise ValueError(f"needs a duration, {count} angles and perhaps the lever")
+        if any(servo.on for servo in self.servos):
+            raise ValueError("its motors have torque: no hand moves it")
+        before = self._hand[-1][1] if self._hand else self._held
+        self._hand.append((seconds, np.array([*end, *before[len(end) :]])))
+
+    @property
+    def _held(self) -> NDArray[np.float64]:
+        lever = [] if self.jaw is None else [1.0 - self.jaw.q / self._ways[-1]]
+        return np.array([*self.plant.q.tolist(), *lever])
+
+    def _move_by_hand(self, dt: float) -> None:
+        if not self._t_hand:
+            self._begun = self._held
+        self._t_hand += dt
+        seconds, end = self._hand[0]
+        share = min(1.0, self._t_hand / seconds)
+        at = self._begun + share**2 * (3.0 - 2.0 * share) * (end - self._begun)
+        count = len(self.joints)
+        self.plant.q[:] = at[:count]
+        if self.jaw is not None:
+            self.jaw.q = (1.0 - float(at[count])) * self._ways[-1]
+        if share >= 1.0:
+            self._hand.popleft()
+            self._t_hand = 0.0
 
     def find(self, id: int) -> list[Servo]:
         """Return the servos with an id, those that are on the bus."""
@@ -96,6 +139,8 @@ class EmulatedArm:
     def place(self, q: Sequence[float]) -> None:
         """Put the arm at rest at a position, rad, without torque, and hold it there until its torque is on."""
         self.plant.place(q)
+        self._hand.clear()
+        self._t_hand = 0.0
         self._report()
         for servo in self.servos:
             servo.restart()
@@ -116,6 +161,8 @@ class EmulatedArm:
         if all(servo.on for servos in self.joints for servo in servos):
             plant.held = False
         plant.step(dt, drives)
+        if self._hand:
+            self._move_by_hand(dt)
         self.peak = [max(peak, abs(speed)) for peak, speed in zip(self.peak, plant.dq.tolist(), strict=True)]
         if self.jaw is not None:
             width = self.object_width if self.world is None else self.world.object_width or 0.0

@@ -28,7 +28,7 @@ from hal_emulators.terminal import PseudoTerminal
 from .arm import EmulatedArm
 from .servo import ALERT, SERVOS, DynamixelServo, Servo
 
-__all__ = ["ServoBusEmulator", "find_arms", "help_text"]
+__all__ = ["ServoBusEmulator", "find_arms", "find_leaders", "help_text"]
 
 _STEP = 0.002
 """Step of the mechanics, s."""
@@ -145,11 +145,26 @@ class ServoLine:
 
 
 def find_arms(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
-    """Return the arms of a rig that this emulator can play. Raises ConfigError and ValueError."""
-    found = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in SERVOS]
-    if not found:
-        raise ValueError("this rig has no arm with Feetech or Dynamixel servos that is not simulated")
-    return found
+    """Return the arms of a rig that this emulator can play. Raises ConfigError."""
+    return [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in SERVOS]
+
+
+def find_leaders(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
+    """Return the leaders of a rig that this emulator can play, as arms that they lead. Raises ConfigError."""
+    arms: dict[str, Any] = {}
+    for pad in load(config, overrides=overrides).resolve().pads:
+        if pad.leader is not None and pad.driver in SERVOS:
+            drivers, real = {"real": pad.driver}, {key: pad.options[key] for key in ("port", "ids")}
+            lever = {"id": pad.options["lever"], "zero": 2048, "widths": [[0, 0], [0.75, 0.1]]}
+            gripper = {"drivers": drivers, "real": lever}
+            own = pad.driver == "feetech"
+            arms[pad.name] = {
+                "model": pad.leader.leads[0],
+                "drivers": drivers,
+                "real": real if own else real | {"zero": 2048},
+            }
+            arms[pad.name] |= {} if own else {"gripper": gripper}
+    return list(load({"sim": False, "robots": arms}).resolve().robots)
 
 
 class ServoBusEmulator:
@@ -310,6 +325,10 @@ def _place(line: ServoLine, words: list[str]) -> None:
     line.arm.place([float(word) for word in words] or line.arm.plant.q.tolist())
 
 
+def _lead(line: ServoLine, words: list[str]) -> None:
+    line.arm.lead(float(words[0]), [float(word) for word in words[1:]])
+
+
 def _push(line: ServoLine, words: list[str]) -> None:
     line.arm.plant.push[int(words[0]) - 1] = float(words[1])
 
@@ -350,6 +369,9 @@ COMMANDS = {
     "turn": _Command("turn ID N", "let a Dynamixel motor count N turns more", _turn),
     "plug": _Command("plug all|N ...", "only these motors are on the bus, counted from the base", _plug),
     "place": _Command("place [Q ...]", "switch off, and hold the arm there until its torque is on", _place),
+    "hand": _Command(
+        "hand S Q ... [LEVER]", "a hand moves a leader there in S seconds, after its other motions", _lead
+    ),
     "push": _Command("push JOINT NM", "push a joint with this torque, until 0", _push),
     "object": _Command("object M|none", "put an object of this width into the jaw", _put),
     "state": _Command("state", "motion, goals, torque, errors", lambda line, _: line.arm.report()),

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from hal_emulators.network_arm import NetworkController
+
 from .motion import ROBOTS, TargetMotion, forward, parameters
 
 __all__ = ["POWER_OFF", "RUNNING", "Controller"]
@@ -35,16 +37,15 @@ _PROGRAM_STOP, _PROTECTIVE_DECELERATION = 8.0, 30.0
 """Deceleration of a program that ends, and of a protective stop, rad/s2; chosen."""
 
 
-class Controller:
+class Controller(NetworkController):
     """One controller with its arm. ``step`` lets a cycle pass."""
 
     def __init__(self, robot: str, q: Sequence[float], payload: float, tcp: Sequence[float]) -> None:
         self.robot, self.dh = robot, parameters(robot)
         self.rate = ROBOTS[robot][2]
-        self.dt = 1.0 / self.rate
+        super().__init__(1.0 / self.rate)
         self.motion = TargetMotion(q, self.dt)
         self.version = (5, 15, 0, 0) if self.rate == 500 else (3, 15, 0, 0)
-        self.now = 0.0
         self.remote = True
         self.robot_mode, self.safety_mode = RUNNING, NORMAL
         self.payload, self.cog, self.tcp = payload, [0.0] * 3, list(tcp)
@@ -60,9 +61,9 @@ class Controller:
         """What pushes the arm, N and Nm in the controller's base."""
         self.stuck = False
         """Whether it ignores set-points of ``servoj``."""
+        self.jump = 0.0
+        """By how much the next one is off, rad."""
         self.offset = 0
-        self.events: list[str] = []
-        """What happened, the newest last."""
         self._starts: tuple[float, str, int] | None = None
         self._watchdog: float | None = None
         self._t_written = self._t_protective = 0.0
@@ -70,9 +71,9 @@ class Controller:
         """Whether the command that blocks the script is over."""
         self._executing = False
 
-    def note(self, event: str) -> None:
-        """Keep an event, with its time."""
-        self.events = [*self.events[-49:], f"{self.now:.3f} {event}"]
+    @property
+    def joints(self) -> Sequence[float]:
+        return self.motion.actual_q
 
     # Programs.
 
@@ -119,6 +120,13 @@ class Controller:
             self.note(f"protective stop: {why}")
             self.safety_mode, self._t_protective = PROTECTIVE_STOP, time.monotonic()
             self.stop_program("protective stop")
+            self.motion.stop(_PROTECTIVE_DECELERATION)
+
+    def set_safety(self, mode: int) -> None:
+        """Be in a mode of the safety system; 4, 8 and 9 are recovery, violation and fault, 6 the system's stop."""
+        self.safety_mode = mode
+        if mode != NORMAL:
+            self.stop_program(f"safety mode {mode}")
             self.motion.stop(_PROTECTIVE_DECELERATION)
 
     def stop_emergency(self, pressed: bool) -> None:
@@ -262,7 +270,8 @@ class Controller:
             if not self.inputs.get(f"input_int_register_{self.offset + 1}", 0):
                 self._busy = lambda: motion.at_rest
         elif command == 11 and not self.stuck:  # servoj
-            motion.servo(x(0, 6), *x(9))
+            motion.servo([value + self.jump for value in x(0, 6)], *x(9))
+            self.jump = 0.0
         elif command == 9:  # speedj
             motion.speed(x(0, 6), *x(6))
         elif command in (15, 16, 33, 34):  # speed_stop, servo_stop, stopl, stopj
@@ -297,7 +306,7 @@ class Controller:
             "safety_mode": self.safety_mode,
             "safety_status": self.safety_mode,
             "robot_status_bits": (self.robot_mode == RUNNING) | (2 if self.program else 0),
-            "safety_status_bits": _SAFETY_BITS[self.safety_mode],
+            "safety_status_bits": _SAFETY_BITS.get(self.safety_mode, 0),
             "runtime_state": PAUSED if self.paused else PLAYING if self.program else STOPPED,
             "speed_scaling": motion.scale * motion.limit,
             "target_speed_fraction": motion.scale,

@@ -14,6 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hal_emulators.network_arm import NetworkController
+
+from .gripper import Gripper
+
 __all__ = ["DT", "ROBOTS", "Controller", "Robot"]
 
 Floats = list[float]
@@ -78,16 +82,17 @@ ROBOTS = {
 """UFACTORY's "Kinematic and Dynamic Parameters" (ufactory_docs), and the SDK's ``XCONF.Robot``."""
 
 
-class Controller:
+class Controller(NetworkController):
     """One controller with its arm. ``step`` lets a cycle pass. Joint positions are of the arm's joints, rad."""
 
     def __init__(self, robot: str, q: Sequence[float]) -> None:
+        super().__init__(DT)
         self.robot, self.arm = robot, ROBOTS[robot]
         self.axes = len(self.arm.rows)
         if len(q) != self.axes:
             raise ValueError(f"an {robot} has {self.axes} joints, not {len(q)}")
-        self.now = 0.0
         self.mode, self.error, self.warning = POSITION, 0, 0
+        self.gripper = Gripper()
         self.enabled = False
         """Whether the motors are switched on."""
         self.pressed = False
@@ -96,10 +101,10 @@ class Controller:
         """Mass, kg, and its centre, mm."""
         self.blind = False
         """Whether the first joint is reported as not a number."""
+        self.jump = 0.0
+        """By how much the next set-point is off, rad."""
         self.blocked = False
         """Whether something holds the joints."""
-        self.events: list[str] = []
-        """What happened, the newest last."""
         self.set_points = 0
         """Number of set-points that were executed."""
         self._halted = STOPPED
@@ -107,9 +112,9 @@ class Controller:
         self.q, self.dq = list(q), [0.0] * self.axes
         self.hold()
 
-    def note(self, event: str) -> None:
-        """Keep an event, with its time."""
-        self.events = [*self.events[-49:], f"{self.now:.3f} {event}"]
+    @property
+    def joints(self) -> Sequence[float]:
+        return self.q
 
     @property
     def state(self) -> int:
@@ -207,6 +212,7 @@ class Controller:
         if not self.ready or self.mode != SERVO:
             return False
         now = time.monotonic()
+        q, self.jump = [value + self.jump for value in q], 0.0
         self._course.append((min(max(now - self._t_set, _SHORTEST), _LONGEST), list(q)))
         self._t_set = now
         took = sum(dt for dt, _ in list(self._course)[1:])
@@ -231,6 +237,7 @@ class Controller:
     def step(self) -> None:
         """Let a cycle pass."""
         self.now += DT
+        self.gripper.step(DT)
         if self._goal is not None:
             self._plan()
         share, most = 0.0 if self.blocked else 1.0 - math.exp(-DT / _LAG), math.pi * DT

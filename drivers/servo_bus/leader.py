@@ -1,0 +1,122 @@
+"""Drivers of leader arms on a servo bus: the motors have no torque, and nothing is written to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import pi
+from typing import ClassVar, Literal
+
+from hal.config.files import Problems, check_record, validate
+from hal.config.schema import Strict
+from hal.errors import ConnectionLost
+from hal.leader import Angles, LeaderDriver
+from hal.specs import PadSpec
+
+from .chain import Chain, Joint
+from .dynamixel import Dynamixel
+from .feetech import Feetech
+from .protocol import COUNT, ServoProtocol
+from .settings import MotorId, ServoSettings
+
+_WIDEST = 3.0
+"""Widest range of a calibrated lever, rad."""
+
+
+class ServoLeaderSettings(Strict):
+    """Options of a leader on a servo bus (``leaders.<name>.options``, and its ``port``)."""
+
+    port: str
+    ids: tuple[MotorId, ...]
+    """Ids of the joints' motors, from base to tip."""
+    lever: MotorId | None = None
+    """Id of the lever's motor."""
+    lever_deg: tuple[float, float] | None = None
+    """Angle of the lever's motor where it is open, and closed; None: upper and lower end of its calibrated range."""
+    zero: int | None = None
+    """Count of every joint's motor at which its angle is 0; None for the middle of its calibrated range."""
+    baud: Literal[57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000] = 1_000_000
+
+
+def check_leader(spec: PadSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in a leader's record: key in its entry of the rig file, message and code."""
+    problems = Problems()
+    settings = validate(ServoLeaderSettings, spec.options, "", problems, "options")
+    for problem in problems.found:
+        yield problem.key.replace("options.port", "port"), problem.message, problem.code
+    if problems.found or spec.leader is None:
+        return
+    if len(settings.ids) != len(spec.leader.joints):
+        yield "options.ids", f"has {len(settings.ids)} motors for {len(spec.leader.joints)} joints", "wrong_count"
+    if settings.lever is None and spec.leader.lever != "none":
+        yield "options.lever", "is missing: the id of its motor; or set lever: none", "missing_key"
+
+
+class ServoLeader(LeaderDriver):
+    """A leader on a servo bus (options: :class:`ServoLeaderSettings`)."""
+
+    protocol: ClassVar[type[ServoProtocol]]
+
+    def __init__(self, spec: PadSpec, source: object | None = None) -> None:
+        super().__init__(spec, source)
+        own = self.settings = check_record(ServoLeaderSettings, spec.options, f"leaders.{spec.name}.options")
+        motors = dict(zip(self.leader.joints, own.ids, strict=True))
+        if own.lever is not None:
+            motors["the lever"] = own.lever
+        joints = [Joint(label, (id,), 0.0) for label, id in motors.items()]
+        bus = ServoSettings(port=own.port, baud=own.baud)
+        self.chain = Chain(spec.name, self.protocol(), bus, joints, watch=False)
+
+    def read_angles(self, now: float) -> Angles:
+        chain = self.chain
+        try:
+            if chain.bus is None:
+                chain.open()
+                self._find_ends()
+            states = chain.read(now)
+            holding = [label for label, state in zip(chain.labels, states, strict=True) if state.on]
+            if holding:
+                text = f"{', '.join(holding)} has torque: this may be a follower; if not, switch its supply off and on"
+                raise ConnectionLost(text, code="has_torque")
+        except BaseException:
+            chain.close()
+            raise
+        angles = [COUNT * (s.position - zero) for s, zero in zip(states, self._zeros, strict=False)]
+        t = min(state.t for state in states)
+        return Angles(t, angles, 0.0 if self.settings.lever is None else self._pulled(COUNT * states[-1].position))
+
+    def _find_ends(self) -> None:
+        """Note zeros and the ends of the lever. Raises ConnectionLost if the lever is not calibrated."""
+        own, stored = self.settings, [registers.calibration for registers in self.chain.registers]
+        middles = [0.5 * (c.range_min + c.range_max) for c in stored[: len(own.ids)]]
+        self._zeros = middles if own.zero is None else [float(own.zero)] * len(own.ids)
+        if own.lever_deg is not None:
+            self._opened, self._closed = (angle * pi / 180.0 for angle in own.lever_deg)
+        else:
+            self._opened, self._closed = COUNT * stored[-1].range_max, COUNT * stored[-1].range_min
+        span = abs(self._opened - self._closed)
+        if own.lever is not None and not 0.0 < span < _WIDEST:
+            text = (
+                f"the lever (motor {own.lever}): its range is {span:.2f} rad; calibrate it, or give options.lever_deg"
+            )
+            raise ConnectionLost(text, code="not_calibrated")
+
+    def _pulled(self, angle: float) -> float:
+        middle = 0.5 * (self._opened + self._closed)
+        angle -= 2.0 * pi * round((angle - middle) / (2.0 * pi))
+        return min(max((self._opened - angle) / (self._opened - self._closed), 0.0), 1.0)
+
+    def close(self) -> None:
+        super().close()
+        self.chain.close()
+
+
+class FeetechLeader(ServoLeader):
+    """A leader with Feetech servos, such as that of an SO-101."""
+
+    protocol = Feetech
+
+
+class DynamixelLeader(ServoLeader):
+    """A leader with Dynamixel servos, such as a GELLO."""
+
+    protocol = Dynamixel

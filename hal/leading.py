@@ -1,0 +1,186 @@
+"""Following a leader: turns the states of a leader arm into targets for an arm, without a jump when it is engaged."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .commands import CartesianTarget, JointTarget, JointVelocity
+from .config.mapping import TeleopMapping
+from .errors import CommandError
+from .geometry import Pose
+from .kinematics.arm import Kinematics
+from .leader import Leader
+from .teleop import Teleop
+from .types import PadState, RobotStatus
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from .commands import Command
+    from .gamepad import Gamepad
+    from .robot import Robot
+    from .specs import LeaderSpec
+    from .types import RobotState
+
+Array = NDArray[np.float64]
+_STILL = 1e-3
+"""Speed of every joint's set-point below which the arm counts as at rest, rad/s."""
+_REACH = 0.999
+"""Share of the arm's reach that a pose may have."""
+STATE_AGE = 2.0
+"""Greatest age of a state to start from, s."""
+
+
+class LeaderTeleop(Teleop):
+    """Turns the states of a leader into commands.
+
+    While it is engaged, the arm follows what the leader moves from the moment of engaging on, so that engaging never
+    moves the arm. It is engaged while a button is pressed, from when the arm follows commands and its set-point is at
+    rest. An arm of the leader's own kind follows joint to joint, any other one by the pose of the leader's tcp: along
+    the axes of both bases.
+
+    Args:
+        robot: The arm.
+        leader: The leader.
+        mapping: Name or path of a mapping, for the dead-man and the buttons.
+        speed: Share of the arm's speed in coming to the leader (``engage: approach``), above 0, at most 1.
+
+    Raises:
+        ConfigError: The mapping is wrong.
+        CommandError: The speed is out of range, or the leader cannot lead this arm (``code`` is ``cannot_lead``).
+    """
+
+    def __init__(
+        self, robot: Robot, leader: Leader, mapping: str | Path | TeleopMapping = "leader", speed: float = 1.0
+    ) -> None:
+        super().__init__(robot, mapping, speed)
+        self.leader, self.spec = leader, leader.spec
+        self.button = self.mapping.deadman
+        """Button that engages it."""
+        self._kinematics: Kinematics | None = None
+        if robot.spec.model not in self.spec.leads:
+            if self.spec.kinematics is None:
+                message = f"{leader.name} cannot lead {robot.name}: {explain_leads(self.spec)}"
+                raise CommandError(message, code="cannot_lead")
+            self._kinematics = Kinematics(self.spec.kinematics)
+        elif len(self.spec.joints) != robot.n:
+            message = f"{leader.name} has {len(self.spec.joints)} joints, {robot.name} {robot.n}"
+            raise CommandError(message, code="cannot_lead")
+        self._anchor: _Anchor | None = None
+
+    def reset(self) -> None:
+        """Disengage: the arm stays where it is until it follows commands and is at rest, and the button is pressed."""
+        super().reset()
+        self._anchor = None
+
+    def prepare_takeover(self) -> None:
+        """Engage by the mapping's ``take_over`` instead of the dead-man. Raises CommandError if there is none."""
+        if self.mapping.take_over is None:
+            raise CommandError("this mapping has no button take_over, with which a leader takes over", code="no_button")
+        self.button = self.mapping.take_over
+
+    def is_touched(self, pad: PadState) -> bool:
+        """Return whether the button that engages it is pressed."""
+        return pad.pressed(self.button)
+
+    def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
+        """Return the command for a state of the leader.
+
+        Args:
+            pad: The leader's state.
+            dt: Time since the last step, s.
+
+        Returns:
+            The target for the arm, or a velocity of zero while it does not follow; and the grip from 0 (open) to 1
+            (closed), or None to leave the gripper alone.
+
+        Raises:
+            StaleStateError: The arm's state is too old.
+            ConnectionLost: The arm does not answer.
+        """
+        grip = self._grip(pad)
+        state = self.robot.state(STATE_AGE)
+        if not (pad.joints and pad.pressed(self.button) and state.status is RobotStatus.FOLLOWING):
+            self._anchor = None
+        elif self._anchor is None and np.abs(state.dq_set).max() < _STILL:
+            self._anchor = self._make_anchor(pad.joints, state)
+        if self._anchor is None:
+            return JointVelocity(np.zeros(self.robot.n)), grip
+        return self._anchor.follow(np.array(pad.joints), dt), grip
+
+    def _make_anchor(self, joints: tuple[float, ...], state: RobotState) -> _Anchor:
+        if self._kinematics is not None:
+            return _PoseAnchor(self.robot, self._kinematics, self.spec.pose_scale, np.array(joints), state.tcp_set)
+        speed = self.speed * self.robot.spec.move_speed if self.spec.engage == "approach" else 0.0
+        return _JointAnchor(np.array(joints), state.q_set, speed * np.array(self.robot.limits.velocity))
+
+    def help(self, pad: Gamepad) -> list[str]:
+        """Return how the arm follows, and what the controls do, in lines of text."""
+        how = "by the pose of its tcp" if self._kinematics is not None else "joint to joint"
+        return [f"{self.robot.name} follows {self.spec.title} {how}", *super().help(pad)]
+
+
+class _JointAnchor:
+    """Where leader and arm were when they engaged, and how far the arm has come to the leader since.
+
+    Args:
+        leader: Joint positions of the leader (n,), rad.
+        arm: Set-point of the arm (n,), rad.
+        speed: Greatest speed at which each joint comes to the leader (n,), rad/s; zeros for a clutch.
+    """
+
+    def __init__(self, leader: Array, arm: Array, speed: Array) -> None:
+        self._leader, self._arm = leader, arm
+        self._way = leader - arm
+        self._rate = float(np.min(speed / np.maximum(np.abs(self._way), 1e-9)))
+        self._share = 0.0
+
+    def follow(self, joints: Array, dt: float) -> JointTarget:
+        """Return the target for the present joint positions of the leader (n,), rad."""
+        target = self._arm + (joints - self._leader) + self._share * self._way
+        self._share = min(1.0, self._share + self._rate * dt)
+        return JointTarget(target)
+
+
+class _PoseAnchor:
+    """Where the tcps of leader and arm were when they engaged.
+
+    Args:
+        robot: The arm.
+        kinematics: That of the leader.
+        scale: Way of the arm's tcp for each m of the leader's.
+        joints: Joint positions of the leader (n,), rad.
+        tcp: Pose of the arm's set-point.
+    """
+
+    def __init__(self, robot: Robot, kinematics: Kinematics, scale: float, joints: Array, tcp: Pose) -> None:
+        self._kinematics, self._scale, self._tcp = kinematics, scale, tcp
+        self._leader = kinematics.pose(joints)
+        self._back = Pose((0.0, 0.0, 0.0), self._leader.orientation).inverse()
+        self._farthest = _REACH * robot.kinematics.farthest()
+
+    def follow(self, joints: Array, dt: float) -> CartesianTarget:
+        """Return the target for the present joint positions of the leader (n,), rad."""
+        here = self._kinematics.pose(joints)
+        position = self._tcp.position + self._scale * (here.position - self._leader.position)
+        position *= min(1.0, self._farthest / max(float(np.linalg.norm(position)), 1e-9))
+        turned = Pose((0.0, 0.0, 0.0), here.orientation) @ self._back
+        return CartesianTarget(Pose(position, (turned @ self._tcp).orientation))
+
+
+_Anchor: TypeAlias = _JointAnchor | _PoseAnchor
+
+
+def make_teleop(robot: Robot, pad: Gamepad, mapping: str | Path | TeleopMapping, speed: float = 1.0) -> Teleop:
+    """Return what turns the states of a gamepad, or of a leader, into commands for an arm."""
+    return LeaderTeleop(robot, pad, mapping, speed) if isinstance(pad, Leader) else Teleop(robot, mapping, speed)
+
+
+def explain_leads(spec: LeaderSpec) -> str:
+    """Return which arms a leader leads."""
+    return (
+        f"{spec.title} leads {', '.join(spec.leads)} joint to joint, and its model has no `arm` to lead others by poses"
+    )

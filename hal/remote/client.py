@@ -1,0 +1,135 @@
+"""The end of a link at the program: the arms that another computer serves, and the process in place of their host."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import ConnectionLost, HalError
+from ..host.process import Channel, ChannelClosed, SharedMemory, pack_error, unpack_error
+from ..host.records import GroupMemory
+from ..kinematics.composition import keep_urdf
+from ..specs import GroupSpec, RobotSpec, from_json
+from .boxes import boxes_of_hosts, boxes_of_program
+from .link import ANSWER_LIMIT, CLOSE_LIMIT, PORT, RigLink, describe_version
+
+PERIOD = 0.001
+"""Longest time from a new record of the program to its frame, s."""
+
+
+def split_address(at: str) -> tuple[str, int]:
+    """Return name and port of ``NAME[:PORT]``, of which IPv6 addresses are in brackets."""
+    name, colon, port = at.rpartition(":") if not at.endswith("]") else (at, "", "")
+    return (name.strip("[]"), int(port)) if colon else (at.strip("[]"), PORT)
+
+
+def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
+    """Connect to another computer, and return the link with its first answer.
+
+    Args:
+        at: Its address.
+        purpose: What the connection is for: ``{"want": "robots"}`` or ``{"want": "control", ...}``.
+
+    Raises:
+        ConnectionLost: Nothing answers there (``code`` is ``no_server``).
+        HalError: The server's refusal: another version (``version_mismatch``), or ``in_use``.
+    """
+    try:
+        sock = socket.create_connection(split_address(at), timeout=ANSWER_LIMIT)
+    except OSError as error:
+        text = f"nothing answers at {at} ({error.strerror or error}): start `hal serve --config RIG` on that computer"
+        raise ConnectionLost(text, code="no_server") from None
+    link = RigLink(sock, at, PERIOD / 2.0)
+    try:
+        link.post(describe_version() | purpose)
+        answer = link.await_message()
+        if "error" in answer:
+            raise unpack_error(answer["error"])
+    except BaseException:
+        link.close()
+        raise
+    return link, answer
+
+
+def fetch_robots(at: str) -> dict[str, RobotSpec]:
+    """Return the arms that another computer serves, by name. Raises as :func:`connect`.
+
+    Their URDFs are those of this computer where they are the same, else copies in the user's cache; the meshes of
+    these are missing.
+    """
+    link, answer = connect(at, {"want": "robots"})
+    link.close()
+    files = {path: _place_urdf(path, text) for path, text in answer["urdfs"].items()}
+    found = {}
+    for data in answer["robots"]:
+        spec = from_json(RobotSpec, data)
+        kinematics = replace(spec.kinematics, urdf=files[spec.kinematics.urdf])
+        found[spec.name] = replace(spec, at=at, urdf=files[spec.urdf], kinematics=kinematics)
+    return found
+
+
+def _place_urdf(path: str, text: str) -> str:
+    """Return the path of a URDF with this text on this computer."""
+    try:
+        if Path(path).read_text(encoding="utf-8") == text:
+            return path
+    except (OSError, UnicodeDecodeError):
+        pass
+    return str(keep_urdf(text.encode(), Path(path).stem))
+
+
+class LinkClient:
+    """The process in place of a host: it copies between the program's memory and a link, and passes requests on."""
+
+    def __init__(self, channel: Channel, memory: GroupMemory, spec: GroupSpec, realtime: bool) -> None:
+        assert spec.at is not None
+        self._channel = channel
+        self._parent = os.getppid()
+        robots = [[robot.name, len(robot.joints)] for robot in spec.robots]
+        purpose = {"want": "control", "robots": robots, "grippers": list(memory.grippers), "realtime": realtime}
+        self._link, _ = connect(spec.at, purpose)
+        self._link.outgoing = boxes_of_program([memory], memory.robots, memory.grippers)
+        self._link.incoming = boxes_of_hosts([memory], memory.robots, memory.grippers)
+        self._ended_by = float("inf")
+        """Time at which this process ends anyway, s, once it was asked to close."""
+
+    def run(self) -> None:
+        """Copy until the program closes this process, or is gone, or the link is."""
+        try:
+            self._copy()
+        except ChannelClosed:  # the program is gone
+            pass
+        except HalError as error:  # the program's next call raises it
+            print(error)
+            self._channel.send({"error": pack_error(error)})
+        finally:
+            self._link.close()
+
+    def _copy(self) -> None:
+        link, channel = self._link, self._channel
+        while os.getppid() == self._parent and time.monotonic() < self._ended_by:
+            link.wait(PERIOD, channel.sock)
+            request = channel.poll()
+            if request is not None:
+                link.post(request)
+                if request["method"] == "close":
+                    self._ended_by = time.monotonic() + CLOSE_LIMIT
+            for message in link.receive():
+                if "closed" in message:
+                    return
+                if "error" in message and "id" not in message:
+                    raise unpack_error(message["error"])
+                channel.send(message)
+            link.send()
+
+
+def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
+    """Run the child process of a group at another computer."""
+    spec = from_json(GroupSpec, config["group"])
+    memory = GroupMemory.of(memories[0].buffer, spec)
+    LinkClient(channel, memory, spec, bool(config.get("realtime", False))).run()

@@ -1,0 +1,173 @@
+"""A rig over two computers: a program drives an arm that ``hal serve`` has; whatever happens in between stops it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from errors_kit import raises_code
+from link_kit import Bench, served_arm
+from waiting import wait_until
+
+import hal
+from hal.errors import ConnectionLost, ControlTaken, NotSupported
+from hal.host import records
+from hal.servo.watchdog import SILENCE
+from hal.types import RobotStatus, Trip
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
+LATE = 0.02
+"""Of a process that a busy computer lets wait, s."""
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    """A served mock arm, and a proxy before it."""
+    with served_arm() as found:
+        yield found
+
+
+def drive(rig: hal.Rig) -> dict[str, Any]:
+    """A program as on one computer: a motion, a stream to a goal, a grip, a stop."""
+    arm = rig.robots["panda"]
+    arm.move_to(arm.home + [0.3, 0, 0, 0, 0, 0, 0], speed=0.5)
+    moved = arm.state().q_set
+    goal = arm.home + [0.25, 0.05, 0, 0, 0, 0, 0]
+    with arm.control(rate_hz=10) as control:
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointTarget(goal), grip=1.0)
+            if np.abs(arm.state().q_set - goal).max() < 1e-12 and arm.gripper.state().outcome.name == "DONE":
+                break
+            assert tick.elapsed < 20.0
+        streamed = arm.state().q_set
+        rig.stop()
+        with pytest.raises(hal.MotionStopped) as stop:
+            while True:
+                control.send(hal.JointTarget(goal))
+                rig.clock.sleep(0.01)
+        control.rearm()
+        wait_until(lambda: control.trip is Trip.NONE, "acknowledged")
+    return {"moved": moved, "streamed": streamed, "width": arm.gripper.state().width, "stop": stop.value.code}
+
+
+def test_the_same_program_drives_an_arm_of_another_computer() -> None:
+    """``hal serve --sim`` as a program; set-points at rest are the same as on one computer."""
+    run = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", "127.0.0.1:0"]
+    server = subprocess.Popen([*run, "--set", "cameras={}"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        line = next(line for line in server.stdout if line.startswith("listening at "))
+        at = line.removeprefix("listening at ").partition(",")[0]
+        with hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
+            state = rig.robots["panda"].state()
+            assert 0.0 <= rig.clock.now() - state.stamp.t < 0.1
+            there = drive(rig)
+            link = rig.statistics()[at]["link"]
+            assert abs(link["offset_s"]) <= link["round_trip_s"] / 2.0, "one computer has one clock"
+        with hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides={"cameras": {}}) as rig:
+            here = drive(rig)
+        assert np.abs(there["moved"] - here["moved"]).max() < 1e-9
+        assert np.abs(there["streamed"] - here["streamed"]).max() < 1e-9
+        assert there["stop"] == here["stop"] == Trip.STOP.code
+        assert abs(there["width"] - here["width"]) < 1e-3
+        server.send_signal(signal.SIGINT)
+        assert server.wait(20.0) == 130
+    finally:
+        server.kill()
+
+
+@pytest.mark.parametrize("deadman", [True, False], ids=["dead-man", "no dead-man"])
+def test_a_link_that_stalls_stops_the_arm_until_it_is_acknowledged(bench: Bench, deadman: bool) -> None:
+    program = bench.drive(deadman)
+    began = time.monotonic()
+    bench.proxy.stalled.set()
+    wait_until(lambda: bench.servo().trip is not Trip.NONE, "stopped")
+    assert bench.servo().trip in (Trip.DEADMAN_SILENT, Trip.APP_SILENT)
+    assert bench.servo().t_stop - began <= SILENCE + LATE
+    wait_until(lambda: bench.speed() == 0.0, "at rest")
+    bench.proxy.stalled.clear()  # and everything that waited comes at once
+    program.wait_for("stopped", bench.servo().trip.code)
+    rest = bench.servo().q_set
+    time.sleep(0.3)
+    assert bench.servo().q_set == rest, "commands and the dead-man that is still held move nothing"
+    for word in ("release", "press") if deadman else ("rearm",):
+        program.tell(word)
+        assert word != "release" or bench.servo().q_set == rest
+    wait_until(lambda: bench.speed() > 0.15, "the arm moves again")
+
+
+@pytest.mark.parametrize("what", ["the program", "its process for the link"])
+@pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_program_that_freezes_or_is_killed(bench: Bench, what: str, how: signal.Signals) -> None:
+    program = bench.drive()
+    hosts = [host.child.process for host in bench.server.served.hosts]
+    mail, pid = bench.mail, program.process.pid if what == "the program" else program.link
+    began = time.monotonic()
+    os.kill(pid, how)
+    try:
+        wait_until(lambda: mail.peek().status is not RobotStatus.FOLLOWING, "stopped")
+        assert mail.peek().t_stop - began <= SILENCE + LATE
+        if how is signal.SIGKILL or what != "the program":  # the link is silent for 2 s, or gone
+            wait_until(lambda: all(host.poll() is not None for host in hosts), "nothing is left")
+            wait_until(lambda: bench.server.served is None, "free for the next client")
+    finally:
+        if how is signal.SIGSTOP:
+            os.kill(pid, signal.SIGCONT)
+    if what == "the program" and how is signal.SIGSTOP:
+        assert program.wait_for("stopped")
+
+
+def test_a_link_that_is_cut_ends_the_program_and_a_new_one_moves_nothing_by_itself(bench: Bench) -> None:
+    program = bench.drive()
+    mail, began = bench.mail, time.monotonic()
+    bench.proxy.cut()
+    wait_until(lambda: mail.peek().status is not RobotStatus.FOLLOWING, "stopped")
+    assert mail.peek().t_stop - began <= SILENCE + LATE
+    assert "closed the connection" in program.wait_for("lost")
+    wait_until(lambda: bench.server.served is None, "free for the next client")
+    with hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig:
+        rest = rig.robots["panda"].state().q_set
+        rig.clock.sleep(0.3)
+        assert (rig.robots["panda"].state().q_set == rest).all()
+        assert rig.robots["panda"].state().status is RobotStatus.IDLE
+
+
+def test_frames_that_are_lost_repeated_or_out_of_order_change_nothing(bench: Bench) -> None:
+    bench.proxy.delay = 0.01
+    bench.drive()
+    bench.proxy.trouble = 0.1
+    q = bench.servo().q_set[0]
+    wait_until(lambda: abs(bench.servo().q_set[0] - q) > 0.3, "the arm moves on")
+    assert bench.servo().trip is Trip.NONE
+    assert bench.servo().q_set[0] > q
+
+
+def test_a_link_with_a_long_round_trip_opens_no_session(bench: Bench) -> None:
+    bench.proxy.delay = 0.06
+    with hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig:
+        assert rig.robots["panda"].state(1.0).status is RobotStatus.IDLE
+        with raises_code(ConnectionLost, "link_too_slow"), rig.robots["panda"].control():
+            pass
+
+
+def test_who_may_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = {"robots": {"panda": {"at": bench.proxy.at}}}
+    with hal.open(rig, pad="none"), raises_code(ControlTaken, "in_use"):
+        hal.open(rig, pad="none")
+    monkeypatch.setattr("hal.remote.link.LAYOUT", records.LAYOUT + 1)
+    monkeypatch.setattr("hal.remote.server.describe_version", lambda: {"version": "0.0", "layout": records.LAYOUT})
+    with raises_code(NotSupported, "version_mismatch"):
+        hal.open(rig, pad="none")
+    bench.server.close()
+    bench.proxy.close()
+    with raises_code(ConnectionLost, "no_server"):
+        hal.open(rig, pad="none")

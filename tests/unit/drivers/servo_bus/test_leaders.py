@@ -1,0 +1,125 @@
+"""A leader on a servo bus: what it reads, what it refuses, and that it never writes."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from time import monotonic
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from servo_bus_kit import SteppedServos, so101_leader
+
+from hal.config import load
+from hal.driver import PadReading
+from hal.drivers.servo_bus import bus
+from hal.drivers.servo_bus.leader import DynamixelLeader, FeetechLeader
+from hal.leader import Leader
+from hal.lock import DeviceLock
+from hal_emulators.servo_bus.server import ServoBusEmulator, find_leaders
+
+Q = [0.3, -0.4, 0.5, 0.2, -1.0]
+
+
+@pytest.fixture
+def far() -> Iterator[SteppedServos]:
+    with SteppedServos() as emulator:
+        emulator.arm.place(Q)
+        yield emulator
+
+
+@pytest.fixture
+def leader(far: SteppedServos) -> Iterator[FeetechLeader]:
+    with closing(so101_leader(far)) as driver:
+        driver.open()
+        yield driver
+
+
+def poll(leader: FeetechLeader) -> PadReading:
+    return leader.poll(monotonic(), 0.0)
+
+
+def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader: FeetechLeader) -> None:
+    before = {id: bytes(servo.registers[:56]) for id, servo in {servo.id: servo for servo in far.arm.servos}.items()}
+    assert poll(leader).joints == pytest.approx(Q, abs=0.001)
+    far.execute("hand 0.1 0 0 0.1 0 0 1")
+    far.advance(0.2)
+    reading = poll(leader)
+    assert reading.joints == pytest.approx([0, 0, 0.1, 0, 0], abs=0.001)
+    assert reading.axes["r2"] == pytest.approx(1.0, abs=0.01)
+    leader.close()
+    assert {
+        id: bytes(servo.registers[:56]) for id, servo in {servo.id: servo for servo in far.arm.servos}.items()
+    } == before
+
+
+@pytest.mark.parametrize(
+    ("command", "cause"),
+    [
+        ("register 2 40 1", "shoulder_lift (motor 2) has torque"),
+        ("register 3 3 1234", "elbow_flex (motor 3): is of the model 1234"),
+        ("register 6 11 4095", "the lever (motor 6): its range is"),
+        ("silent 4 on", "no answer from wrist_flex (motor 4)"),
+        ("unplug on", "No such file"),
+    ],
+)
+def test_what_is_no_leader_is_refused_by_name(
+    command: str, cause: str, far: SteppedServos, leader: FeetechLeader
+) -> None:
+    far.execute(command)
+    far.advance(0.01)
+    assert not poll(leader).connected
+    assert cause in leader.describe()
+    assert leader.notes == (f"lead: {leader.describe().partition(': ')[2]}",)
+
+
+def test_a_port_that_another_program_uses_is_left_to_it(far: SteppedServos, leader: FeetechLeader) -> None:
+    lock = DeviceLock(f"servo-bus-{os.path.realpath(far.arm.port)}", "the servo bus", 0.1)
+    with patch.object(bus, "_PATIENCE", 0.0):
+        assert not poll(leader).connected
+    assert "in use" in leader.describe()
+    lock.release()
+    assert leader.poll(monotonic() + 1.0, 0.0).connected
+
+
+def test_a_gello_is_read_by_its_own_signs_offsets_and_trigger(tmp_path: Path) -> None:
+    """Its motors are mounted anywhere, and one counts turns."""
+    signs, port = (1, -1, 1, 1, 1, -1, 1), str(tmp_path / "gello.emulated")
+    entry = {"model": "gello_franka", "port": port, "offsets": [math.pi] * 7, "options": {"lever_deg": [223, 180]}}
+    rig = {"leaders": {"lead": entry}}
+    with ServoBusEmulator(find_leaders(rig), paced=False) as far, patch.multiple(bus, _ANSWER=2.0):
+        far.arms["lead"].place([0.2, -0.5, 0.1, -2.0, 0.3, 1.8, 0.7])
+        with closing(DynamixelLeader(load(rig).resolve().pads[0])) as leader:
+            leader.open()
+            reading = poll(leader)
+            led = [sign * q for sign, q in zip(signs, (0.2, -0.5, 0.1, -2.0, 0.3, 1.8, 0.7), strict=True)]
+            led[5] += 2 * math.pi  # the turn nearest to 1.571
+            assert leader.describe() == f"GELLO for a Franka at {port}"
+            assert reading.joints == pytest.approx(led, abs=0.002)
+            far.execute("turn 2 1")
+            far.execute("hand 0.1 0.2 -0.5 0.1 -2.0 0.3 1.8 0.8 0.5")
+            far.advance(0.12)
+            later = poll(leader)
+            assert later.joints == pytest.approx([*led[:6], 0.8], abs=0.002)
+            assert later.axes["r2"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_an_emulated_leader_may_not_lead_a_real_arm(leader: FeetechLeader) -> None:
+    assert "no person holds it" in str(Leader(leader).distrust())
+
+
+def test_the_hand_moves_motors_without_torque_only(far: SteppedServos) -> None:
+    far.execute("register 1 40 1")
+    with pytest.raises(ValueError, match="have torque"):
+        far.execute("hand 1 0 0 0 0 0")
+    far.execute("register 1 40 0")
+    far.execute("hand 0.2 0 0 0 0 0")
+    far.execute("hand 0.2 0.1 0 0 0 0 0.5")
+    far.advance(0.2)
+    assert far.arm.plant.q == pytest.approx(np.zeros(5), abs=1e-3)
+    far.advance(0.2)
+    assert far.arm.plant.q == pytest.approx([0.1, 0, 0, 0, 0], abs=1e-3)

@@ -1,0 +1,69 @@
+"""Emulated SO-101 leaders, moved as by hands, drive two arms in real time, by the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
+
+from app_kit import CROSS, PS, run_here, write_pad
+
+from hal.apps import collect, replay
+from hal.recording import Dataset
+from hal_emulators.servo_bus.server import ServoBusEmulator, find_leaders
+
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
+
+RIG = """
+robots:
+  small: {model: so101}
+  large: {model: panda, base: {position: [0, 1, 0]}}
+leaders:
+  left: {model: so101_leader, port: left.emulated, drives: small}
+  right: {model: so101_leader, port: right.emulated, drives: large}
+gamepads:
+  pad: {model: auto}
+"""
+POSES = ("0 0 0 0 0 0", "0.15 0.2 -0.2 0.15 0.2 1", "-0.15 -0.1 0.2 -0.1 0.1 0")
+
+
+def test_two_leaders_drive_two_arms_and_the_recording_is_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Joint to joint an SO-101, by poses a Panda."""
+    monkeypatch.chdir(tmp_path)
+    Path("rig.yaml").write_text(RIG)
+    taps = [(float(t), CROSS) for t in (1, 2, 3)]  # on a busy computer the first ones come too early
+    pad = write_pad(tmp_path, *taps, (5.8, PS), until=20.0, held=(3.4, 5.5))
+    rig = ["--config", "./rig.yaml", "--sim"]
+    with ServoBusEmulator(find_leaders("./rig.yaml")) as emulator:
+        for turn in range(60):
+            for leader in ("left", "right"):
+                emulator.execute(f"{leader} hand 1 {POSES[turn % 3]}")
+        options = [
+            "--robot",
+            "small,large",
+            "--pad",
+            pad,
+            "--episodes",
+            1,
+            "--out",
+            "data",
+            "--report",
+            "collected.json",
+        ]
+        done = run_here(collect.main, *rig, *options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(Path("collected.json").read_text())["trips"] == []
+    (episode,) = Dataset("data").episodes
+    moved = dict(zip(episode.names("action"), np.ptp(episode.columns["action"], axis=0), strict=True))
+    assert min(moved["small.shoulder_lift"], moved["large.panda_joint1"]) > 0.05, moved
+    for robot in ("small", "large"):
+        options = ["--robot", robot, "--unattended", "--report", "played.json"]
+        played = run_here(replay.main, "data", *rig, *options)
+        assert played.returncode == 0, played.stdout + played.stderr
+        assert json.loads(Path("played.json").read_text())["deviation"]["tcp_mm"]["max"] < 2.0, played.stdout

@@ -1,0 +1,116 @@
+"""Demonstrations with a UR and two webcams, as a lab collects and replays them; the cameras' kernel is in memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+import time
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("av", reason="needs PyAV: pip install 'robot-hal[record]'")
+
+from webcam_kit import grey, webcams
+
+import hal
+from hal.apps import collect, replay
+from hal.recording import Dataset
+
+from .ur_kit import UrEmulator
+
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
+
+RATE = 30
+
+
+class Operator(io.StringIO):
+    """The program's output, and a person who reads it with a pad in the hands."""
+
+    pad: Any = None
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.at_home = threading.Event()
+
+    def write(self, text: str) -> int:
+        act = {"then hold it until": self.hold, "place the objects": self.start, "RECORDING": self.drive}
+        for words, what in act.items():
+            if words in text:
+                threading.Thread(target=what).start()
+        return super().write(text)
+
+    def hold(self) -> None:
+        while not self.at_home.wait(2.0):  # a press that was too early does not count
+            self.pad.release("l2")
+            time.sleep(0.2)
+            self.pad.press("l2")
+
+    def start(self) -> None:
+        self.at_home.set()
+        self.pad.release("l2")
+        self.tap("south")
+
+    def tap(self, button: str) -> None:
+        time.sleep(0.2)
+        self.pad.press(button)
+        time.sleep(0.2)
+        self.pad.release(button)
+
+    def drive(self) -> None:
+        self.pad.press("l2")
+        self.pad.stick("dpad_y", 1.0)
+        time.sleep(1.0)
+        self.pad.press("l1")
+        time.sleep(1.0)
+        self.pad.set(axes={"dpad_y": 0.0}, buttons=())
+        time.sleep(0.5)
+        self.tap("home")
+
+
+def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    emulator, person, opened = UrEmulator(), Operator(), hal.open
+
+    def open_rig(**options: Any) -> hal.Rig:
+        rig = opened(**options)
+        person.pad = rig.driver("pad")
+        return rig
+
+    camera = {"model": "webcam", "capture": {"width": 64, "height": 48, "rate_hz": RATE}}
+    ports = {"left": "1-1", "right": "1-2"}
+    rig = emulator.rig() | {"gamepads": {"pad": {"driver": "mock"}}}
+    rig["cameras"] = {name: camera | {"real": {"port": port}} for name, port in ports.items()}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    options = ["--real", "--config", str(tmp_path / "rig.yaml")]
+    data, report = str(tmp_path / "data"), tmp_path / "report.json"
+    try:
+        with (
+            webcams(tmp_path, *({"port": port} for port in ports.values())),
+            redirect_stdout(person),
+            monkeypatch.context() as patched,
+        ):
+            patched.setattr(hal, "open", open_rig)
+            words = ["--speed", "0.3", "--out", data, "--episodes", "1", "--task", "reach"]
+            assert collect.main([*options, *words]) == 0, person.getvalue()
+        (episode,) = Dataset(data).episodes
+        for name in ports:
+            late = episode.stamps["grid"] - episode.stamps[f"camera.{name}"]
+            assert ((late >= 0.0) & (late < 1.5 / RATE)).all(), "each row has the newest picture when it was due"
+            numbers = episode.columns[f"rig.time.camera.{name}"][:, 2].astype(int)
+            shown = np.array([frame.mean() for frame in episode.frames(name)])
+            assert np.abs(shown - [grey(number) for number in numbers]).max() < 6.0, "and it is that picture"
+        assert np.ptp(episode.columns["observation.state"][:, :6], axis=0).max() > 0.05, "the arm was driven"
+
+        assert replay.main([data, *options, "--set", "cameras={}", "--unattended", "--report", str(report)]) == 0
+        deviation = json.loads(report.read_text())["deviation"]["tcp_mm"]
+        print(f"tcp {deviation['max']:.2f} mm")
+        assert deviation["max"] < 2.0
+    finally:
+        emulator.close()
