@@ -129,9 +129,8 @@ class ServoArm(RobotDriver):
         dq = tuple(s * COUNT * state.velocity for s, state in zip(self._signs, states, strict=True))
         commanded = self._find_commanded(states) if self.engaged else None
         fault = self._judge(states, q, commanded)
-        if self.engaged and self._sent and not self._written:
-            still = (0.0,) * len(q)
-            self.write(Setpoint(self._sent[-1][1].q, still, still))  # between sessions it creeps on
+        if self.engaged and self._sent and not self._written and max(map(abs, self._sent[-1][1].dq)) < _REST:
+            self.write(self._sent[-1][1])  # between sessions it creeps on
         self._written = False
         reading = Reading(t, t, self._seq, q, dq, fault=fault)
         if commanded is None or not self.engaged:
