@@ -20,6 +20,8 @@ OUTSIDE = 0.05
 """How far a joint may be outside of its calibrated range, rad, and still be driven: it may rest on its stop."""
 _TWIST = 0.1
 """How far two motors of a joint may be apart, rad: further, they work against each other. Chosen."""
+_PING = 0.06
+"""Longest time to wait for its first answer, s: a late one must not look like that of a second motor."""
 _TWIN = 0.003
 """Time to wait for the answer of a second motor with the same id, s."""
 _SCAN = 20
@@ -132,7 +134,7 @@ class Chain:
         """Return whether a motor answers. Raises DeviceNotFound if two do."""
         surplus, spoilt = bus.surplus, bus.spoilt
         for _ in range(3):
-            if bus.ask(id, PING, b"", (id,), linger=_TWIN) and (bus.surplus, bus.spoilt) == (surplus, spoilt):
+            if bus.ask(id, PING, b"", (id,), _PING, _TWIN) and (bus.surplus, bus.spoilt) == (surplus, spoilt):
                 return True
             if bus.surplus + bus.spoilt >= surplus + spoilt + 3:
                 raise DeviceNotFound(
