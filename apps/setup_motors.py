@@ -65,18 +65,18 @@ def main(args: argparse.Namespace) -> int:
 def calibrate_arm(args: argparse.Namespace) -> int:
     """Run ``hal calibrate arm``; return the exit status."""
     with _open_service(args) as service:
+        _ask("the torque goes off: support the arm, then press Enter")
         if args.restore is not None:
-            _ask("the torque goes off: support the arm, then press Enter")
             try:
                 service.restore(json.loads(Path(args.restore).read_text(encoding="utf-8")))
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise CommandError(f"--restore {args.restore} is no calibration of this arm: {error}") from None
             print(f"{args.restore} is stored in the motors")
             return 0
-        _ask("the torque goes off: support the arm, then press Enter")
         service.relax()
         _ask(f"move every joint {service.pose}, then press Enter")
         service.take_middle()
+        seen = service.watch()
         ended = threading.Event()
         threading.Thread(target=_wait_for_enter, args=(ended,), daemon=True).start()
         while not ended.wait(_PERIOD):

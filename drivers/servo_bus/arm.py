@@ -41,7 +41,7 @@ _LEAD = 0.1
 """Greatest lead of a goal for the weight, rad."""
 _SLOW = 40
 """Greatest speed of a motor that counts as at rest, counts/s; a Dynamixel reports steps of 16."""
-_CREEP, _DEAD, _MOST, _REST = 5.0, 1.1 * COUNT, 0.03, 0.01
+_CREEP, _DEAD, _MOST, _REST = 5.0, 1.7 * COUNT, 0.03, 0.01
 """At rest, the share of a joint's distance from its set-point that its goal creeps on in a second, the distance at
 which it stops, rad, the most that it goes, rad, and the speed of a set-point at rest, rad/s: chosen."""
 _FOLLOWING, _LAG, _FOLLOWING_PATIENCE = 0.2, 0.15, 0.1
@@ -129,7 +129,7 @@ class ServoArm(RobotDriver):
         dq = tuple(s * COUNT * state.velocity for s, state in zip(self._signs, states, strict=True))
         commanded = self._find_commanded(states) if self.engaged else None
         fault = self._judge(states, q, commanded)
-        if self.engaged and self._sent and not self._written:
+        if self.engaged and self._sent and not self._written and max(map(abs, self._sent[-1][1].dq)) < _REST:
             self.write(self._sent[-1][1])  # between sessions it creeps on
         self._written = False
         reading = Reading(t, t, self._seq, q, dq, fault=fault)

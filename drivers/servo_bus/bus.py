@@ -229,6 +229,8 @@ class ServoBus:
         end = monotonic() + _ANSWER
         answers = self.read_all(self.protocol.state, self.ids, end)
         self.cycles += 1
+        for id in {*self._status} - {*answers}:  # it may have lost its power
+            del self._status[id]
         if self.protocol.status is not None and not self._wait:
             new = self.read_all(self.protocol.status, self._choose(answers), end)
             self._status.update((id, answer.data) for id, answer in new.items())

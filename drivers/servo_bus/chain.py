@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from math import inf
 from time import monotonic
 from typing import NamedTuple
@@ -19,6 +20,8 @@ OUTSIDE = 0.05
 """How far a joint may be outside of its calibrated range, rad, and still be driven: it may rest on its stop."""
 _TWIST = 0.1
 """How far two motors of a joint may be apart, rad: further, they work against each other. Chosen."""
+_PING = 0.06
+"""Longest time to wait for its first answer, s: a late one must not look like that of a second motor."""
 _TWIN = 0.003
 """Time to wait for the answer of a second motor with the same id, s."""
 _SCAN = 20
@@ -57,11 +60,12 @@ class Chain:
     def __init__(
         self, name: str, protocol: ServoProtocol, settings: ServoSettings, joints: Sequence[Joint], watch: bool
     ) -> None:
-        self.name, self.protocol, self.settings, self.joints, self.watch = name, protocol, settings, joints, watch
+        self.name, self.protocol, self.settings, self.joints, self._watch = name, protocol, settings, joints, watch
+        self._watched = False
+        """Whether the motors stop when they hear nothing."""
         self.motors = {id: f"{joint.label} (motor {id})" for joint in joints for id in joint.ids}
         self.labels = [
-            self.motors[joint.ids[0]] if len(joint.ids) == 1 else f"{joint.label} (motors {joint.ids})"
-            for joint in joints
+            f"{joint.label} (motor{'s' * (len(joint.ids) > 1)} {', '.join(map(str, joint.ids))})" for joint in joints
         ]
         self.ids = tuple(self.motors)
         self.bus: ServoBus | None = None
@@ -96,10 +100,14 @@ class Chain:
         self._t_heard, self._turns, self.lost = {}, {}, None
 
     def close(self) -> None:
-        """Give up the bus, without any frame: the motors keep their goals. Idempotent."""
+        """Give up the bus: the motors keep their goals, and need no frames any more. Idempotent."""
         bus, self.bus = self.bus, None
         if bus is not None:
+            if self._watched and self.protocol.watchdog is not None:
+                with suppress(ConnectionLost):
+                    bus.write(self.protocol.watchdog, dict.fromkeys(self.ids, b"\0"))
             bus.release(self.ids)
+        self._watched = False
 
     def _identify(self, bus: ServoBus) -> None:
         missing = [id for id in self.ids if not self._ping(bus, id)]
@@ -126,7 +134,7 @@ class Chain:
         """Return whether a motor answers. Raises DeviceNotFound if two do."""
         surplus, spoilt = bus.surplus, bus.spoilt
         for _ in range(3):
-            if bus.ask(id, PING, b"", (id,), linger=_TWIN) and (bus.surplus, bus.spoilt) == (surplus, spoilt):
+            if bus.ask(id, PING, b"", (id,), _PING, _TWIN) and (bus.surplus, bus.spoilt) == (surplus, spoilt):
                 return True
             if bus.surplus + bus.spoilt >= surplus + spoilt + 3:
                 raise DeviceNotFound(
@@ -275,9 +283,10 @@ class Chain:
         """Give motors that are off their goals, counts, and torque limits, and take away their profile."""
         counts, spread = self._count_goals(goals), self._spread(limits)
         for address, values in self.protocol.prepare(
-            self.ids, [counts[id] for id in self.ids], [spread[id] for id in self.ids], self.watch
+            self.ids, [counts[id] for id in self.ids], [spread[id] for id in self.ids], self._watch
         ):
             self.write(address, values)
+        self._watched = self._watch
 
     def switch_on(self) -> None:
         """Switch the torque of all motors on, which also ends an overload of a Feetech motor."""

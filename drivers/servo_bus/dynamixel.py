@@ -73,7 +73,7 @@ class Dynamixel(ServoProtocol):
     stored: ClassVar[Block] = (0, 86)
     state: ClassVar[Block] = (116, 31)
     status: ClassVar[Block] = (64, 38)
-    torque, limit, id_address, baud_address, delay_address, lock = 64, 100, 7, 8, 9, None
+    torque, watchdog, limit, id_address, baud_address, delay_address, lock = 64, 98, 100, 7, 8, 9, None
     goal: ClassVar[Block] = (116, 4)
     position: ClassVar[Block] = (132, 4)
     free: ClassVar[tuple[int, int]] = (11, MULTI)  # in the mode of one turn it takes an offset of a quarter of it only

@@ -40,7 +40,7 @@ class Feetech(ServoProtocol):
     full = 1000
     stored: ClassVar[Block] = (0, 40)
     state: ClassVar[Block] = (40, 31)
-    status = None
+    status = watchdog = None
     torque, limit, id_address, baud_address, delay_address, lock = 40, 48, 5, 6, 7, 55
     goal: ClassVar[Block] = (42, 2)
     position: ClassVar[Block] = (56, 2)

@@ -111,6 +111,8 @@ class ServoProtocol(ABC):
     limit: ClassVar[int]
     """Address of the torque limit, two bytes."""
     goal: ClassVar[Block]
+    watchdog: ClassVar[int | None]
+    """Address of the time without a frame after which it stops, 0 for never; None if it has none."""
     position: ClassVar[Block]
     id_address: ClassVar[int]
     baud_address: ClassVar[int]

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from servo_bus_kit import SteppedServos
+from waiting import wait_until
 
 from hal import registry
 from hal.apps import calibrate, setup_motors
@@ -76,8 +77,7 @@ def test_an_arm_is_calibrated_by_hand_and_its_file_restores_it(
         seen = len(watched)
         for q, share in ((plant.lower, 0.0), (plant.upper, 1.0)):
             move(q, share)
-            while len(watched) < seen + 2:
-                pass
+            wait_until(lambda: len(watched) >= seen + 2, "seen")  # noqa: B023
             seen = len(watched)
 
     watched: list[Any] = []

@@ -156,7 +156,11 @@ REFUSED = {
     "register 4 {mode} 1": (ConfigError, "mode|not set to positions"),
     "register 1 {low} 2000": (ConfigError, "calibrate it"),
 }
-PLACES = {"Feetech": {"model": 3, "mode": 33, "low": 9, "high": 11}, "Dynamixel": {"model": 0, "mode": 11, "low": 52}}
+PLACES = {
+    "Feetech": {"model": 3, "mode": 33, "low": 9, "sensor": 2, "current": 8},
+    "Dynamixel": {"model": 0, "mode": 11, "low": 52, "sensor": 8, "current": 16},
+}
+"""Registers, and bits of errors."""
 
 
 @pytest.mark.parametrize("command", REFUSED)
@@ -176,12 +180,13 @@ def test_a_motor_that_follows_another_one_is_refused(viperx: Arm) -> None:
 
 FAULTS = {"error 3 32": "overload", "voltage all 17": "voltage", "voltage 2 3.5": "voltage"}
 FAULTS |= {"temperature 5 85": "too_hot", "power 0": "switched_off"}
+FAULTS |= {"error 1 {sensor}": "sensor", "error 1 {current}": "overcurrent"}
 
 
 @pytest.mark.parametrize("command", FAULTS)
 def test_a_fault_is_named_stops_the_arm_and_is_over_after_recover(arm: Arm, command: str) -> None:
     arm.engage()
-    arm.far.execute(command)
+    arm.far.execute(command.format(**PLACES[arm.driver.protocol.name]))
     reading = arm.run(0.06)
     assert reading.fault is not None
     assert reading.fault.code == FAULTS[command]
@@ -203,7 +208,7 @@ def test_two_motors_of_a_joint_that_disagree_are_named(viperx: Arm) -> None:
     viperx.far.arm.servos[2].put(20, -100)
     fault = viperx.run(0.02).fault
     assert fault is not None
-    assert (fault.code, "motors (2, 3)" in fault.cause) == ("twisted", True)
+    assert (fault.code, "motors 2, 3" in fault.cause) == ("twisted", True)
 
 
 @pytest.mark.parametrize("turns", [-3, 1])
@@ -246,6 +251,9 @@ def test_a_motor_stops_when_it_hears_nothing_and_is_switched_on_anew(viperx: Arm
         viperx.run()
     assert viperx.driver.engaged
     assert viperx.run().q == pytest.approx(there, abs=3e-3)
+    viperx.driver.close()
+    viperx.far.advance(0.25)
+    assert viperx.far.arm.servos[0].registers[98] == 0, "other programs can use the motors, which hold"
 
 
 def test_a_joint_outside_of_its_range_is_not_driven(so101: Arm) -> None:

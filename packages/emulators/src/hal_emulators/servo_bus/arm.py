@@ -19,8 +19,6 @@ from hal_emulators.shared_world import ArmInWorld
 
 from .servo import SERVOS, Servo
 
-__all__ = ["EmulatedArm"]
-
 
 def _find_mechanics(servos: Sequence[Servo]) -> JointMechanics:
     """Return the mechanics of motors that turn a joint together: shares of their torque, chosen."""

@@ -75,8 +75,9 @@ class ServoLine:
                 servo.quiet = 0.0
 
     def _can_hear(self, servo: Servo) -> bool:
-        rate = getattr(termios, f"B{servo.baud}", None)
-        return servo.plugged and servo.boot <= monotonic() and rate == self.terminal.baud and not self._is_silent(servo)
+        now, rate = monotonic(), getattr(termios, f"B{servo.baud}", None)
+        silent = any(self.silent_until.get(key, 0.0) > now for key in (0, servo.id))
+        return servo.plugged and servo.boot <= now and rate == self.terminal.baud and not silent
 
     def _take(self, frame: Answer) -> None:
         id, instruction, data = frame
@@ -110,10 +111,6 @@ class ServoLine:
         for servo in self._hearing:
             if isinstance(servo, DynamixelServo) and id == servo.registers[12] != servo.id and address >= servo.memory:
                 servo.write(address, data)
-
-    def _is_silent(self, servo: Servo) -> bool:
-        now = monotonic()
-        return any(self.silent_until.get(key, 0.0) > now for key in (0, servo.id))
 
     def _is_lost(self, id: int) -> bool:
         for key in (id, 0):
