@@ -124,13 +124,14 @@ class ConsoleServer:
         due = time.monotonic()
         while os.getppid() == self._parent:
             now = time.monotonic()
+            late = round(now - due, 3)
             self._session.check_pad(now)
             self._live.abort_stuck(now)
             self._pictures.abort_stuck(now)
             self._connections.close_idle(now)
             if self._session.pages:
                 self._session.send_state(
-                    {"t": now, **self._telemetry.snapshot(now), "cameras": self._cache.report(now)}
+                    {"t": now, "late": late, **self._telemetry.snapshot(now), "cameras": self._cache.report(now)}
                 )
             due = max(due + _STATE_PERIOD, now)
             await asyncio.sleep(due - now)

@@ -35,12 +35,6 @@ _MAX_REQUESTS = 16
 """Requests of pages that may wait for the app."""
 _MAX_NOTES = 256
 """Messages that must not be left out and may wait for one page."""
-_TOO_SLOW = (
-    f"{{}}: the network is too slow, or a computer too busy, to drive "
-    f"(a round trip may take {1e3 * PAD_SILENCE:g} ms at most)"
-)
-_COMPLAINT_PERIOD = 2.0
-"""Shortest time between two complaints to one page about that, in s."""
 _KEPT_LINES = 50
 """Newest lines of the app that a page gets when it opens."""
 
@@ -55,8 +49,6 @@ class PadVerdict(NamedTuple):
     """Why the pad was lost before or with this message; None if it was not, or had been lost already."""
     t_alive: float | None = None
     """Time at which the page provably was in this state, in s; None if the message does not count."""
-    dropped: str | None = None
-    """Why the message does not count, for the page's user; None if there is nothing to report."""
 
 
 class PadWatch:
@@ -95,12 +87,12 @@ class PadWatch:
             return PadVerdict()  # sent before the page was given control this time
         claimed = message.seen + message.since
         if not claimed - now <= PAD_SILENCE:
-            return PadVerdict(self.disconnect(CLOCK_AHEAD), dropped=CLOCK_AHEAD)
+            return PadVerdict(self.disconnect(CLOCK_AHEAD))
         # Messages arrive in the order in which they were sent: what one proves, the next one proves too.
         alive = max(self._alive, min(now, claimed))
         gap, self._alive = alive - self._alive, alive
         if not now - alive <= PAD_SILENCE:
-            return PadVerdict(self.disconnect(MESSAGES_LATE), dropped=MESSAGES_LATE)
+            return PadVerdict(self.disconnect(MESSAGES_LATE))
         lost = self.disconnect(PAGE_SILENT) if gap > PAD_SILENCE else None
         self.connected = True
         return PadVerdict(lost, alive)
@@ -168,8 +160,6 @@ class WebPage:
         self.number = number
         self.name = f"page {number}"
         self.queue = SendQueue(overflow)
-        self.complained = -math.inf
-        """Time of the last complaint that its pad messages come late, in s."""
 
 
 class WebSession:
@@ -265,9 +255,6 @@ class WebSession:
         verdict = watch.judge(message, now)
         if verdict.lost is not None:
             self._lose_pad(now, verdict.lost)
-        if verdict.dropped is not None and not now - page.complained < _COMPLAINT_PERIOD:
-            page.complained = now
-            self._refuse(page, _TOO_SLOW.format(verdict.dropped))
         if verdict.t_alive is not None:
             pad = {"connected": True, "t": now, "t_alive": verdict.t_alive, "axes": message.axes}
             self._to_app.put_newest("pad", {"pad": {**pad, "buttons": message.buttons, "from": page.name}})

@@ -7,7 +7,7 @@ import contextlib
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from aiohttp import WSMsgType, web
 
@@ -33,7 +33,7 @@ MAX_MALFORMED = 100
 MAX_PAGES = 16
 _MAX_REFUSED = 16
 """Sockets with a wrong token that are open at the same time to report that. More of them are not opened."""
-_PING_AFTER = 10.0
+PING_AFTER = 10.0
 """Time without a message after which a page is sent a ping, in s."""
 _CLOSE_TIME = 1.0
 """Time for answering a close, and for which a page that sent too much is still read, in s."""
@@ -258,7 +258,7 @@ class PageSockets(ABC):
         """Handle a page's request for a socket, from its opening to its end."""
         if not self._auth.is_valid_token(request.headers.get("Sec-WebSocket-Protocol")):
             return await self._refuse(request)
-        ws = await _open(request, heartbeat=_PING_AFTER)
+        ws = await open_socket(request, heartbeat=PING_AFTER)
         transport = request.transport
         if len(self._sockets) >= MAX_PAGES:
             await _close(ws, _TOO_MANY_PAGES)
@@ -281,7 +281,7 @@ class PageSockets(ABC):
             raise web.HTTPForbidden(text="too many come with a wrong token\n")
         self._refused += 1
         try:
-            ws = await _open(request)
+            ws = await open_socket(request)
             await _close(ws, _WRONG_TOKEN)
         finally:
             self._refused -= 1
@@ -300,13 +300,19 @@ class PageSockets(ABC):
             await asyncio.wait(closing, timeout=_CLOSE_TIME)
 
 
-async def _open(request: web.Request, heartbeat: float | None = None) -> web.WebSocketResponse:
+async def open_socket(
+    request: web.Request,
+    heartbeat: float | None = None,
+    protocols: Sequence[str] = (PROTOCOL,),
+    max_bytes: int = MAX_BYTES,
+) -> web.WebSocketResponse:
+    """Answer the handshake of a page's WebSocket; HTTPBadRequest if it is none."""
     ws = web.WebSocketResponse(
-        protocols=(PROTOCOL,),
+        protocols=protocols,
         heartbeat=heartbeat,
         timeout=_CLOSE_TIME,
         compress=False,
-        max_msg_size=MAX_BYTES + 1,  # it refuses this many
+        max_msg_size=max_bytes + 1,  # it refuses this many
         writer_limit=1,  # every send waits until the kernel has taken it
     )
     try:

@@ -15,7 +15,7 @@ from typing import Any
 
 from aiohttp import ClientError, ClientSession, UnixConnector, WSMsgType, web
 
-from .sockets import CONNECTIONS, MAX_PAGES, RateLimit
+from .sockets import CONNECTIONS, MAX_PAGES, PING_AFTER, RateLimit, open_socket
 
 STAGE_POLICY = (
     "default-src 'self' blob: data: 'unsafe-inline' 'unsafe-eval'; connect-src 'self' blob: data: ws://{host}; "
@@ -59,10 +59,7 @@ class Stage:
         self._open += 1
         try:
             async with viewer.ws_connect(_SERVER, protocols=offered, max_msg_size=0) as far:
-                near = web.WebSocketResponse(
-                    protocols=offered, heartbeat=10.0, compress=False, max_msg_size=_MAX_BYTES, writer_limit=1
-                )
-                await near.prepare(request)
+                near = await open_socket(request, PING_AFTER, offered, _MAX_BYTES)
                 with request.app[CONNECTIONS].exempt(transport):
                     limit = RateLimit()
                     await _first(

@@ -67,4 +67,6 @@ def let_go_of_all(page: Browser) -> None:
 
 
 def lines(page: Browser, words: str) -> int:
-    return page.text("#log").count(words)
+    script = """return [...log.children].filter((one) => one.dataset.text.includes(arguments[0]))
+        .reduce((sum, one) => sum + Number(one.dataset.count), 0)"""
+    return int(page.run(script, words))

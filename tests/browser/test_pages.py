@@ -170,6 +170,36 @@ def test_no_text_is_smaller_than_twelve_pixels(page: Browser, width: int, height
     assert page.run("return document.documentElement.scrollWidth") <= width
 
 
+CONTRAST = """
+    const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+    const light = (colour) => parts(colour).slice(0, 3).map((c) => c / 255)
+      .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4))
+      .reduce((sum, c, k) => sum + c * [0.2126, 0.7152, 0.0722][k], 0);
+    const clear = (e) => e && (Number(getComputedStyle(e).opacity) < 1 || clear(e.parentElement));
+    const ground = (e) => {
+      const colour = getComputedStyle(e).backgroundColor;
+      return (parts(colour)[3] ?? 1) === 1 || !e.parentElement ? colour : ground(e.parentElement);
+    };
+    return found.filter(([at]) => !clear(at) && !at.closest('.camera, #overlay')).map(([at, text]) => {
+      const [low, high] = [light(getComputedStyle(at).color), light(ground(at))].sort((a, b) => a - b);
+      return [text, (high + 0.05) / (low + 0.05)];
+    }).filter(([, contrast]) => contrast < 4.5)"""
+
+
+def test_every_text_can_be_read_and_every_control_has_a_name(page: Browser) -> None:
+    """WCAG AA, light and dark, with an alarm; what a screen reader is told."""
+    page.tap("Escape", "Escape")
+    wait_for(lambda: page.text("#trip"), "the alarm")
+    for _ in range(2):
+        assert page.run(TEXTS + CONTRAST) == []
+        page.click("#theme")
+        wait_for(lambda: page.run("return !document.getAnimations().length"), "the other colours")
+    nodes = page.cdp("Accessibility.getFullAXTree")["nodes"]
+    controls = [node for node in nodes if node.get("role", {}).get("value") in ("button", "slider", "image")]
+    assert len(controls) > 15
+    assert [node for node in controls if not node["ignored"] and not node["name"]["value"]] == []
+
+
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (1024, 768), (960, 600)])
 def test_every_key_that_drives_is_named_on_a_screen_with_a_keyboard(page: Browser, width: int, height: int) -> None:
     """960x600 is a laptop's window at 150 % zoom."""

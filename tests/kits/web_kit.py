@@ -63,8 +63,17 @@ class App:
         self.rings = frame_rings(self.ring_memory.buffer, cameras)
         self.host_memory = SharedMemory(GroupMemory.size(JOINTS, GRIPPERS))
         self.group = GroupMemory(self.host_memory.buffer, JOINTS, GRIPPERS)
-        known = {"source": "test", "sim": True, "attended": False, "drivable": True, "driven_by": None, "demo": True}
+        known = {
+            "source": "test",
+            "sim": True,
+            "attended": False,
+            "drivable": True,
+            "driven_by": None,
+            "demo": True,
+            "stage": "",
+        }
         settings = {
+            "viewer": "",
             "rig": {**known, "robots": [{"name": "arm"}], "cameras": [], **(rig or {})},
             "listen": ["127.0.0.1", 0],
             "port_fixed": False,

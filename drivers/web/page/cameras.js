@@ -182,8 +182,9 @@ class Stage {
     frame.title = "3D view: drag the gizmo on the tool, and the arm moves to it while the dead-man is held";
     frame.tabIndex = -1;
     // The keys stay with this page: a press does not move the focus, and what gets it all the same gives it back.
+    const keep = (/** @type {Event} */ event) => event.preventDefault();
     frame.addEventListener("load", () => {
-      frame.contentDocument?.addEventListener("mousedown", (/** @type {Event} */ event) => event.preventDefault(), true);
+      for (const type of ["mousedown", "contextmenu", "dragstart"]) frame.contentDocument?.addEventListener(type, keep, true);
     });
     addEventListener("blur", () => setTimeout(() => document.activeElement === frame && (frame.blur(), focus())));
     const caption = make("figcaption");
@@ -237,23 +238,23 @@ export class Cameras {
   /** @param {any[]} cameras @param {string} stage */
   #build(cameras, stage) {
     this.seen.disconnect();
-    const enlarge = (/** @type {string} */ name) => this.#enlarge(name);
+    const enlarge = (/** @type {string} */ name) => this.#enlarge(name, true);
     this.views = cameras.map((camera) => new View(camera, enlarge));
     this.stage = stage ? new Stage(stage, enlarge) : null;
     this.shown = this.stage ? [this.stage, ...this.views] : this.views;
     byId("cameras").replaceChildren(...this.shown.map((view) => view.figure));
     const names = this.shown.map((view) => view.name);
     segments(byId("tabs"), names, enlarge);
-    if (names.length) enlarge(names[this.stage?.slow && this.views.length ? 1 : 0]);
+    if (names.length) this.#enlarge(names[this.stage?.slow && this.views.length ? 1 : 0], !this.stage?.slow);
     else byId("cameras").append(make("p", "hint", "This rig has no cameras."));
     for (const view of this.views) this.seen.observe(view.figure);
     show(byId("tabs"), names.length > 1);
   }
 
-  /** @param {string} name */
-  #enlarge(name) {
+  /** @param {string} name @param {boolean} open whether the 3D view is to open */
+  #enlarge(name, open) {
     this.large = name;
-    if (name === this.stage?.name) this.stage.open();
+    if (open && name === this.stage?.name) this.stage.open();
     for (const view of this.shown) view.figure.classList.toggle("large", view.name === name);
     choose(byId("tabs"), name);
     this.#place();

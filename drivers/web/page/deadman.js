@@ -30,6 +30,8 @@ export class Heartbeat {
     this.before = [];
     /** Called with the length of a stall of this page, ms. @type {(ms: number) => void} */
     this.stalled = () => {};
+    /** Called with the length of a round trip that is too long, ms. @type {(ms: number) => void} */
+    this.slow = () => {};
     /** Time of the newest round trip, in ms. @type {number | null} */
     this.roundTrip = null;
     pad.changed.push((edge) => this.#changed(edge));
@@ -59,7 +61,10 @@ export class Heartbeat {
   answered(t) {
     this.beats += 1;
     this.#see(t);
-    if (this.#probe !== null) this.roundTrip = performance.now() - this.#probe;
+    if (this.#probe !== null) {
+      this.roundTrip = performance.now() - this.#probe;
+      if (this.roundTrip > STALL) this.slow(this.roundTrip);
+    }
     this.#probe = null;
   }
 

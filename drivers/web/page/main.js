@@ -9,6 +9,7 @@ import { Heartbeat, Presence, ReleaseWatch } from "./deadman.js";
 import { byId, openTheme, setAttribute, setData, setText, show } from "./dom.js";
 import { BrowserGamepad } from "./gamepad.js";
 import { Keyboard } from "./keyboard.js";
+import { PAD_SILENCE } from "./keys.js";
 import { Pad } from "./pad.js";
 import { Recording } from "./recording.js";
 import { Log, Status, Stopping } from "./status.js";
@@ -65,6 +66,7 @@ const HANDLERS = {
     gamepad.mayHold = rig.pad_may_hold;
     controls.paint();
     status.waiting = [];
+    status.forget();
     lease.hello(hello);
     recording.forget();
     panel.open(rig.robots);
@@ -106,6 +108,7 @@ const HANDLERS = {
     log.synchronise(state.t);
     recording.setTime(state.t);
     panel.addState(state);
+    if (state.late > PAD_SILENCE) status.note("late", 1000 * state.late);
     status.show(state.robots, settings.robot || panel.name, 0);
     setText(byId("demo"), state.playing ? "End tour" : "Play tour");
     advise();
@@ -189,8 +192,9 @@ releases.lost = (why) => {
 heartbeat.before.push((dt) => releases.check(dt), (dt) => keyboard.moveGrip(dt), () => gamepad.read());
 heartbeat.stalled = (ms) => {
   log.add("this computer is too busy: the page hung");
-  status.noteHang(ms);
+  status.note("hang", ms);
 };
+heartbeat.slow = (ms) => status.note("slow", ms);
 pad.changed.push(() => advise());
 
 // A finger on STOP counts at once; a click without a pointer comes from the keyboard or an assistive tool.

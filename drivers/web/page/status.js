@@ -5,7 +5,7 @@ import { PAD_SILENCE } from "./keys.js";
 
 const OLD = 500; // ms without a state until the page says so
 const STOPPING = 1000; // ms within which a state shows the stop after the message that STOP was pressed
-const HANG_SHOWN = 2000; // ms between the end of a hang of this page and the state that shows the stop for it
+const NEAR = 2000; // ms between what was measured and the state that shows the stop for it
 const MOVING = 0.005; // rad/s; slower joints are at rest
 
 /** Status of a robot -> label. @type {Record<string, string>} */
@@ -13,11 +13,27 @@ const WORDS = { idle: "idle", holding: "stopped", tripped: "stopped" };
 /** What limits a motion -> label. @type {Record<string, string>} */
 const LIMITS = { speed: "joint speed", "tcp speed": "tool speed", collision: "something near" };
 
+/**
+ * What was measured when the pad was lost -> why the arm is stopped, and what to do about it; the first one counts.
+ * The table of all states of trouble is in docs/console.md.
+ * @type {[string, (seconds: string) => string, string][]}
+ */
+const CAUSES = [
+  ["hang", (seconds) => `this computer is too busy (the page hung for ${seconds} s)`, "Close other programs and tabs."],
+  ["late", (seconds) => `the robot's computer is too busy (${seconds} s late)`, "End other programs on it."],
+  [
+    "slow", (seconds) => `the network is too slow (a round trip took ${seconds} s; at most ${PAD_SILENCE} s)`,
+    "Use a cable, or a computer nearer to the robot.",
+  ],
+];
+
 /** Trip -> text, where a page is the pad. @type {Record<string, string>} */
 const PAGE_TRIPS = {
   deadman_silent: "the page in control gave no sign of life",
   deadman_lost: "the page in control was disconnected",
 };
+
+const TAKE = 'Press "Take control" to drive.';
 
 /** Return the state of the dead-man in one word. @param {any} deadman of a robot's state */
 function deadmanWord(deadman) {
@@ -48,6 +64,7 @@ export class Status {
     this.trip = "none";
     /** Whether this page's pad holds the dead-man. */
     this.held = false;
+    this.present = true;
     /** Name of what is held: "Space", "L2" or "the button". */
     this.holdName = () => "Space";
     byId("recover").addEventListener("click", () => connection.send({ type: "recover", robot: this.faulty }));
@@ -59,13 +76,28 @@ export class Status {
   /** Who pressed STOP last, and when; "" if unknown. */
   #stopped = "";
   #stoppedAt = -Infinity; // ms
-  /** How long this page hung last, and when it woke up, ms. */
-  #hang = { length: 0, at: -Infinity };
+  /** What was measured last, and when, ms. @type {Record<string, {length: number, at: number}>} */
+  #measured = {};
   #trippedAt = -Infinity; // ms
+  /** Time of day at which this page saw the arm stop; "" if it was before. */
+  #since = "";
+  #known = false;
 
-  /** Note that this page hung. @param {number} ms */
-  noteHang(ms) {
-    this.#hang = { length: ms, at: performance.now() };
+  /** Note what may cost the pad: one of CAUSES, and how long it took. @param {string} cause @param {number} ms */
+  note(cause, ms) {
+    this.#measured[cause] = { length: ms, at: performance.now() };
+  }
+
+  /** Start anew with another connection: what an arm is stopped for then is older than the page. */
+  forget() {
+    this.#known = false;
+  }
+
+  /** What was measured about this page when it lost the pad, if it was not let go of on purpose. */
+  get #cause() {
+    if (!this.lease.mine || this.#calm || !(this.trip in PAGE_TRIPS)) return undefined;
+    const found = CAUSES.find(([cause]) => Math.abs(this.#measured[cause]?.at - this.#trippedAt) < NEAR);
+    return found && { text: found[1]((this.#measured[found[0]].length / 1000).toFixed(1)), remedy: found[2] };
   }
 
   /** Note a message of the program. @param {any} message @param {Date} at */
@@ -130,11 +162,15 @@ export class Status {
     const trip = stopped === undefined ? "none" : (robots[stopped].trip ?? "lost");
     const isNew = trip !== "none" && this.trip === "none";
     this.trip = trip;
-    if (isNew) this.#trippedAt = performance.now();
+    if (isNew) {
+      this.#trippedAt = performance.now();
+      this.#since = this.#known ? `, ${new Date().toTimeString().slice(0, 8)}` : "";
+    }
+    this.#known = true;
     if (trip === "none" && performance.now() - this.#stoppedAt > STOPPING) this.#stopped = "";
     if (stopped !== undefined) {
       setText(byId("trip-text"), called(stopped) + this.#why(robots[stopped]));
-      setText(byId("trip-remedy"), robots[stopped].lost ? "Arm state unknown." : this.#remedy());
+      setText(byId("trip-remedy"), this.#remedy(robots[stopped]));
       byId("trip").classList.toggle("alarm", !this.#calm);
       if (isNew && !this.#calm && this.lease.mine && navigator.userActivation?.hasBeenActive) navigator.vibrate?.(200);
     }
@@ -145,19 +181,19 @@ export class Status {
   #why(robot) {
     if (robot.lost) return `No state of the arm: ${robot.lost}`;
     if (robot.trip === "stop") return `Stopped by STOP${this.#stopped && ` (${this.#stopped})`}`;
-    const gone = robot.trip === "deadman_lost" || robot.trip === "deadman_silent";
-    if (gone && Math.abs(this.#hang.at - this.#trippedAt) < HANG_SHOWN) {
-      return `Stopped: this computer is too busy (the page hung for ${(this.#hang.length / 1000).toFixed(1)} s)`;
-    }
-    if (robot.trip === "deadman_lost" && this.#loss.text) return sentence(this.#loss.text);
+    if (this.#cause) return `Stopped: ${this.#cause.text}${this.#since}`;
+    if (robot.trip === "deadman_lost" && this.#loss.text) return `${sentence(this.#loss.text)}${this.#since}`;
     const page = this.lease.rig?.drivable ? PAGE_TRIPS[robot.trip] : "";
-    return `Stopped: ${page || robot.trip_text || robot.trip}`;
+    return `Stopped: ${page || robot.trip_text || robot.trip}${this.#since}`;
   }
 
-  /** Return what to do after a trip. */
-  #remedy() {
-    if (!this.lease.mine) return "The page in control can continue.";
-    return this.trip === "device_lost" ? `When the robot answers again: ${this.#resume()}` : this.#resume();
+  /** Return what to do after a trip. @param {any} robot */
+  #remedy(robot) {
+    if (robot.lost) return "Arm state unknown: use the robot's own stop if it moves.";
+    const { mine, driver, rig } = this.lease;
+    if (!mine) return rig?.drivable ? `${driver ? `View only: ${driver} can continue. ` : ""}${TAKE}` : `${this.lease.text}.`;
+    if (this.trip === "device_lost") return `When the robot answers again: ${this.#resume()}`;
+    return `${this.#cause ? `${this.#cause.remedy} ` : ""}${this.#resume()}`;
   }
 
   /** Whether the dead-man counts only after everything was released. */
@@ -168,7 +204,14 @@ export class Status {
 
   /** Return what makes the arm move again. */
   #resume() {
+    if (!this.present) return "Click this page to continue.";
     return this.mustRelease ? this.#again() : `Hold ${this.holdName()} to continue.`;
+  }
+
+  /** That the network does not let this page hold anything, while it does not; "" otherwise. */
+  get #slow() {
+    const { length, at } = this.#measured.slow ?? { length: 0, at: -Infinity };
+    return performance.now() - at < NEAR ? `: the network is too slow (${length.toFixed(0)} ms)` : "";
   }
 
   #again() {
@@ -182,6 +225,7 @@ export class Status {
    */
   advise(present, held, pushed, playing) {
     this.held = held;
+    this.present = present;
     show(byId("focus"), this.lease.mine && !present);
     setText(byId("waiting"), this.#advice(present, held, pushed, playing));
     const strong = this.lease.mine && (this.mustRelease || (pushed && !held && !playing));
@@ -193,14 +237,14 @@ export class Status {
     const hold = this.holdName();
     if (!this.lease.mine) {
       const free = this.lease.rig?.drivable && this.lease.driver === null;
-      return free ? 'Press "Take control" to drive.' : `${this.lease.text}.`;
+      return free ? TAKE : `${this.lease.text}.`;
     }
     if (!present) return "Click this page to continue.";
-    if (this.faulty) return "The arm has a fault.";
+    if (this.faulty) return 'The arm has a fault: press "Recover".';
     if (this.mustRelease || this.trip !== "none") return this.#resume();
     if (playing) return "The tour is playing.";
     if (!held) return pushed ? `Hold ${hold} too: the arm moves only while it is held.` : `Stopped. Hold ${hold} to move.`;
-    if (this.deadman !== "held") return "Hold signal not received";
+    if (this.deadman !== "held") return `Hold signal not received${this.#slow}`;
     if (this.status === "holding") return this.#again(); // held since before a session began
     return this.moving ? "Moving" : "Ready";
   }
@@ -301,6 +345,7 @@ function doubts(robots) {
 }
 
 const MAX_LINES = 200;
+const RECENT = 6; // lines of which one that comes again is counted, with its newest time
 
 /** The messages of the program, with the time of day. */
 export class Log {
@@ -320,17 +365,14 @@ export class Log {
   /** Add a line. @param {string} text @param {number | null} [t] on the app's clock, s; null: now @returns {Date} its time */
   add(text, t = null) {
     const at = t === null || this.shift === null ? new Date() : new Date(1000 * (t + this.shift));
-    const last = this.list.lastElementChild;
-    if (last instanceof HTMLElement && last.dataset.text === text) {
-      last.dataset.count = String(Number(last.dataset.count) + 1);
-      setText(/** @type {Element} */ (last.lastElementChild), `${text} (${last.dataset.count} times)`);
-      return at;
-    }
+    const same = [...this.list.children].slice(-RECENT).find((one) => one.dataset.text === text);
+    const count = same ? Number(same.dataset.count) + 1 : 1;
+    same?.remove();
     const line = make("li");
     const time = make("time", "", at.toTimeString().slice(0, 8));
     time.dateTime = at.toISOString();
-    line.append(time, make("span", "", text));
-    Object.assign(line.dataset, { text, count: 1 });
+    line.append(time, make("span", "", count > 1 ? `${text} (${count} times)` : text));
+    Object.assign(line.dataset, { text, count });
     const atEnd = this.list.scrollHeight - this.list.scrollTop - this.list.clientHeight < 40;
     this.list.append(line);
     while (this.list.childElementCount > MAX_LINES) this.list.firstElementChild.remove();
