@@ -19,7 +19,7 @@ from link_kit import Bench, served_arm
 from waiting import wait_until
 
 import hal
-from hal.errors import ConnectionLost, ControlTaken, NotSupported
+from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
 from hal.lock import APP_MARK
 from hal.servo.watchdog import SILENCE
@@ -190,10 +190,14 @@ def test_a_link_with_a_long_round_trip_opens_no_session(bench: Bench) -> None:
             pass
 
 
-def test_who_may_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_may_connect_and_ask_for_what(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = {"robots": {"panda": {"at": bench.proxy.at}}}
-    with hal.open(rig, pad="none"), raises_code(ControlTaken, "in_use"):
-        hal.open(rig, pad="none")
+    with hal.open(rig, pad="none") as first:
+        with raises_code(ControlTaken, "in_use"):
+            hal.open(rig, pad="none")
+        for terms in ([1, 0.9, 0.25, False], [1, 0.3, 5.0, False], [1, float("nan"), 0.25, False]):
+            with raises_code(CommandError, "too_fast"):  # whatever the program's own checks let pass
+                first._hosts[0].request("begin", {"robot": "panda", "session": terms})
     monkeypatch.setattr("hal.remote.link.LAYOUT", records.LAYOUT + 1)
     monkeypatch.setattr("hal.remote.server.describe_version", lambda: {"version": "0.0", "layout": records.LAYOUT})
     with raises_code(NotSupported, "version_mismatch"):
