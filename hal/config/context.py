@@ -115,7 +115,9 @@ class Context:
         with suppress(Unknown):
             name = (folder, *parts)[-1].removesuffix("s")
             found = find_file(config.model, f"{name} model", self.base, folder, *parts)
-            if isinstance(found, Path):
+            if not config.model and "model" not in config.model_fields_set:  # needed unless the arm is served
+                self.report(f"{key}.model", "is missing", "missing_key")
+            elif isinstance(found, Path):
                 data = read_yaml(found, self.problems)
                 if data is not None and isinstance(config, RobotConfig):
                     data = self._choose_arm(key, config, data)

@@ -24,9 +24,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic.json_schema import GenerateJsonSchema
-from pydantic_core import PydanticKnownError
 from pydantic_core.core_schema import ModelSchema
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
@@ -254,7 +253,7 @@ class RobotConfig(Device):
     at: Address | None = None
     """The computer that serves this arm (``hal serve``), ``NAME`` or ``NAME:PORT``. Its rig has an arm of this name,
     with all settings; the other keys of this entry are for ``--sim``."""
-    model: Annotated[str, Field(validate_default=True)] = ""
+    model: str = ""
     """A name in ``robots/``, or the path of a file of your own."""
     arm: Name | None = None
     """Which arm, where the model has several (``left`` or ``right`` of a ``baxter``)."""
@@ -279,13 +278,6 @@ class RobotConfig(Device):
     workspace: WorkspaceConfig | None = None
     payload: PayloadConfig | None = None
     """For real arms whose driver holds their weight. Others have settings of their own, such as ``real.load``."""
-
-    @field_validator("model")
-    @classmethod
-    def _check_model(cls, model: str, info: ValidationInfo) -> str:
-        if not model and info.data.get("at") is None:
-            raise PydanticKnownError("missing")
-        return model
 
 
 class Output(Strict):

@@ -229,10 +229,10 @@ _POLL_HZ = 50.0
 def stands_in_world(rig: Rig, robot: Robot) -> bool:
     """Return whether this arm is part of the simulated world, so that it can be placed without driving.
 
-    The mirror of a real arm is not.
+    The mirror of a real arm is not, and neither is one that another computer simulates.
     """
     world = rig.plan.world
-    return world is not None and robot.spec.driver == world.driver
+    return world is not None and robot.spec.at is None and robot.spec.driver == world.driver
 
 
 def reset_scene(

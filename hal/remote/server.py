@@ -84,6 +84,7 @@ class Served:
         realtime = bool(self._wish["realtime"])
         for host in start_processes(make_groups(self._plan), realtime, beating=False):
             self.hosts.append(host)
+            self.link.send()  # the client waits for a sign of life
         robots = {name: self._find_robot(name, n) for name, n in self._wish["robots"]}
         grippers = {name: self._find_gripper(name) for name in self._wish["grippers"]}
         memories = [host.memory for host in self.hosts]

@@ -33,6 +33,16 @@ ELSEWHERE = {
     ),
     "your loop is too slow or hangs": (f"{SYSTEM}ends.py::test_user_code_that_goes_wrong",),
     "the app is killed": (f"{SYSTEM}ends.py::test_an_app_that_ends",),
+    "the [link](several-machines.md) to the computer": (
+        f"{SYSTEM}remote.py::test_a_link_that_stalls_stops_the_arm_until_it_is_acknowledged",
+    ),
+    "that link is cut": (
+        f"{SYSTEM}remote.py::test_a_link_that_is_cut_ends_the_program_and_a_new_one_moves_nothing_by_itself",
+        f"{SYSTEM}remote.py::test_a_program_that_freezes_or_is_killed",
+        f"{SYSTEM}remote.py::test_a_server_that_is_killed_leaves_nothing_and_the_next_call_says_so",
+    ),
+    "a computer that has sent nothing over": ("tests/unit/remote/test_link.py::test_a_silent_end_is_gone",),
+    "longest round trip of a link": (f"{SYSTEM}remote.py::test_a_link_with_a_long_round_trip_opens_no_session",),
     "the host's process dies": (f"{SYSTEM}real_time.py::test_a_host_that_is_killed_is_told_by_the_next_call",),
     "a Franka ends the motion": (f"{WIRE}franka_faults.py", f"{WIRE}franka_stops.py"),
     "a Franka's set-points or states": (f"{WIRE}franka_tour.py::test_packets_that_are_lost_end_no_motion",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -18,8 +19,9 @@ from link_kit import Bench, served_arm
 from waiting import wait_until
 
 import hal
-from hal.errors import ConnectionLost, ControlTaken, NotSupported
+from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
+from hal.lock import APP_MARK
 from hal.servo.watchdog import SILENCE
 from hal.types import RobotStatus, Trip
 
@@ -59,14 +61,19 @@ def drive(rig: hal.Rig) -> dict[str, Any]:
     return {"moved": moved, "streamed": streamed, "width": arm.gripper.state().width, "stop": stop.value.code}
 
 
-def test_the_same_program_drives_an_arm_of_another_computer() -> None:
-    """``hal serve --sim`` as a program; set-points at rest are the same as on one computer."""
+def start_server() -> tuple[subprocess.Popen[str], str]:
+    """Start ``hal serve --sim``; return its process and its address."""
     run = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", "127.0.0.1:0"]
     server = subprocess.Popen([*run, "--set", "cameras={}"], stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    line = next(line for line in server.stdout if line.startswith("listening at "))
+    return server, line.removeprefix("listening at ").partition(",")[0]
+
+
+def test_the_same_program_drives_an_arm_of_another_computer() -> None:
+    """``hal serve --sim`` as a program; set-points at rest are the same as on one computer."""
+    server, at = start_server()
     try:
-        assert server.stdout is not None
-        line = next(line for line in server.stdout if line.startswith("listening at "))
-        at = line.removeprefix("listening at ").partition(",")[0]
         with hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
             state = rig.robots["panda"].state()
             assert 0.0 <= rig.clock.now() - state.stamp.t < 0.1
@@ -81,6 +88,30 @@ def test_the_same_program_drives_an_arm_of_another_computer() -> None:
         assert abs(there["width"] - here["width"]) < 1e-3
         server.send_signal(signal.SIGINT)
         assert server.wait(20.0) == 130
+    finally:
+        server.kill()
+
+
+def find_hosts(server: int) -> list[str]:
+    """Return the processes that own the devices of a server."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            found += [path.parent.name] * (f"{APP_MARK}{server}" in path.read_text().split("\0"))
+    return found
+
+
+def test_a_server_that_is_killed_leaves_nothing_and_the_next_call_says_so() -> None:
+    server, at = start_server()
+    try:
+        with hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
+            assert find_hosts(server.pid)
+            server.kill()
+            with pytest.raises(ConnectionLost, match="connection"):
+                while True:
+                    rig.robots["panda"].check()
+                    time.sleep(0.01)
+            wait_until(lambda: not find_hosts(server.pid), "nothing is left")
     finally:
         server.kill()
 
@@ -132,7 +163,7 @@ def test_a_link_that_is_cut_ends_the_program_and_a_new_one_moves_nothing_by_itse
     bench.proxy.cut()
     wait_until(lambda: mail.peek().status is not RobotStatus.FOLLOWING, "stopped")
     assert mail.peek().t_stop - began <= SILENCE + LATE
-    assert "closed the connection" in program.wait_for("lost")
+    assert "connection" in program.wait_for("lost")
     wait_until(lambda: bench.server.served is None, "free for the next client")
     with hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig:
         rest = rig.robots["panda"].state().q_set
@@ -159,10 +190,14 @@ def test_a_link_with_a_long_round_trip_opens_no_session(bench: Bench) -> None:
             pass
 
 
-def test_who_may_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_may_connect_and_ask_for_what(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = {"robots": {"panda": {"at": bench.proxy.at}}}
-    with hal.open(rig, pad="none"), raises_code(ControlTaken, "in_use"):
-        hal.open(rig, pad="none")
+    with hal.open(rig, pad="none") as first:
+        with raises_code(ControlTaken, "in_use"):
+            hal.open(rig, pad="none")
+        for terms in ([1, 0.9, 0.25, False], [1, 0.3, 5.0, False], [1, float("nan"), 0.25, False]):
+            with raises_code(CommandError, "too_fast"):  # whatever the program's own checks let pass
+                first._hosts[0].request("begin", {"robot": "panda", "session": terms})
     monkeypatch.setattr("hal.remote.link.LAYOUT", records.LAYOUT + 1)
     monkeypatch.setattr("hal.remote.server.describe_version", lambda: {"version": "0.0", "layout": records.LAYOUT})
     with raises_code(NotSupported, "version_mismatch"):
