@@ -195,17 +195,14 @@ class TcpReference:
         q, dq, dt = smoother.q, smoother.dq_next, smoother.dt
         speed, acceleration = hypot(*dq), hypot(*smoother.ddq_next)
         if speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True)):
-            step = dist(smoother.q_next, q) / dt
+            mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
+            step = hypot(*mean)
             # In its stop no joint gets faster than its speed and what its acceleration adds until it is taken back.
             fastest = self._root * max(speed + self._overrun * acceleration, step)
             way = self._reach_length * step * dt + self._per_speed * speed + self._per_acceleration * acceleration
             ramps = self._overrun_tcp * acceleration * acceleration + fastest * way
-            changes = ramps + fastest * self._reach_length * dist(q, self._at)
-            if self._stretch * max(speed, step) + changes <= cap:
-                return True
-            mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
             near = self._centre_speed + self._stretch * max(dist(dq, self._centre), dist(mean, self._centre))
-            if near + changes <= cap:
+            if near + ramps + fastest * self._reach_length * dist(q, self._at) <= cap:
                 return True
             if self._like_proven_stop(mean, fastest) <= cap:
                 return True
