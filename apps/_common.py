@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 import json
 import logging
@@ -245,18 +244,6 @@ def resolve_plan(
         DeviceNotFound: There is no such robot or camera.
         SystemExit: After ``--dry-run``, for which everything is checked and listed; or a check of a real arm failed.
     """
-    from hal.host.process import drop_prepared, prepare_host
-
-    with contextlib.ExitStack() as failed:
-        if clock is None and not args.dry_run:
-            failed.callback(drop_prepared)
-            prepare_host()
-        plan = _check_plan(args, details, cameras, clock)
-        failed.pop_all()
-    return plan
-
-
-def _check_plan(args: argparse.Namespace, details: Iterable[str], cameras: Iterable[str], clock: str | None) -> Plan:
     from hal.apps.check import may_open
     from hal.config import load
     from hal.config.files import suggest

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import math
 import os
@@ -13,7 +12,6 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +21,7 @@ from hal.errors import MotionStopped
 from hal.histogram import Histogram
 from hal.host.main import PeriodicPace
 
-from .kit import ENGINES, ROOT, Table, median, median_ratio, ms, run_in_turns, ticks_missed
+from .kit import ENGINES, ROOT, Table, ms, ticks_missed
 
 PATHS = ("hal/host", "hal/servo", "drivers/scene", "drivers/pybullet", "drivers/mujoco")
 RATES = (240.0, 1000.0)
@@ -131,30 +129,6 @@ def _move_stick(rig: hal.Rig, presses: int) -> list[float]:
     return found
 
 
-START = """
-import sys, time, hal, hal.opening
-if sys.argv[2] == "after":
-    hal.opening.prepare_host = lambda: None
-overrides = [] if sys.argv[3] == "cameras" else ["cameras={}"]
-with hal.open("panda_table", sim=True, engine=sys.argv[1], clock="real_time", pad="none", overrides=overrides) as rig:
-    arm = rig.robots["panda"]
-    with arm.control(rate_hz=50) as control:
-        for tick in rig.clock.rate(50):
-            control.send(hal.Twist([0.0, 0.0, 0.05]))
-            if abs(arm.state().dq_set).max() > 1e-6:
-                break
-    print(time.monotonic())
-"""
-"""A program until its arm moves: its servo's process is started before the rig's file is read, or after (reference)."""
-
-
-def start_program(*words: str) -> float:
-    """Return the time from the start of a Python interpreter to the first set-point that moves, s."""
-    begun = time.monotonic()
-    done = subprocess.run([sys.executable, "-c", START, *words], check=True, capture_output=True, text=True)
-    return float(done.stdout.split()[-1]) - begun
-
-
 def run(quick: bool) -> Iterator[Table]:
     """Yield the tables."""
     seconds, engines, rates = (0.5, ENGINES[:1], RATES[:1]) if quick else (10.0, ENGINES, RATES)
@@ -187,12 +161,4 @@ def run(quick: bool) -> Iterator[Table]:
     )
     for rate in rates:
         table.add(f"{rate:g} Hz", *(ms(follow_stick(rate, presses, woken), 0.5, 0.9) for woken in (False, True)))
-    yield table
-    columns = ("engine", "servo's process before the rig's file", "after (reference)", "ratio")
-    table = Table("start of a program to its first motion, s, medians", columns)
-    for engine, cameras in itertools.product(engines, ("no camera", "cameras")):
-        turns = {when: partial(start_program, engine, when, cameras) for when in ("before", "after")}
-        taken = run_in_turns(turns, 1 if quick else 7)
-        ratio = median_ratio(taken["before"], taken["after"])
-        table.add(f"{engine}, {cameras}", median(taken["before"]), median(taken["after"]), ratio)
     yield table

@@ -64,8 +64,7 @@ if TYPE_CHECKING:
     from .gripper import Gripper, GripperMotion, GripperResult
     from .motion.handle import ArmMotion, ArmMotionResult
     from .observation import Observation
-    from .opening import open_rig
-    from .rig import Rig
+    from .rig import Rig, open_rig
     from .robot import Robot
     from .servo.controllers import JointImpedance, OperationalSpace, Position
     from .session import SessionEvent, TeleopSession
@@ -215,7 +214,7 @@ def __getattr__(name: str) -> Any:
 
         return version("robot-hal")
     if name == "open":
-        value = import_module(".opening", __name__).open_rig
+        value = import_module(".rig", __name__).open_rig
     elif name == "gym":
         value = import_module(".gym", __name__)
     elif name in _HOME:

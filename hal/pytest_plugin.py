@@ -24,7 +24,7 @@ def mock_rig_config() -> Any:
 @pytest.fixture
 def mock_rig(mock_rig_config: Any) -> Iterator[Rig]:
     """Open a rig whose devices are all mocks, in lock-step, for one test; ``mock_rig_config`` names it."""
-    from .opening import open_rig
+    from .rig import open_rig
 
     with open_rig(mock_rig_config, driver="mock") as rig:
         yield rig

@@ -1,4 +1,4 @@
-"""A rig: the named devices of one setup behind one clock."""
+"""A rig: the named devices of one setup behind one clock. :func:`open_rig` is ``hal.open``."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import logging
 import os
 import threading
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 
@@ -39,6 +40,63 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 _FIRST_FRAME = 5.0
 """Longest wait for a camera's first frame, s."""
+
+
+def open_rig(
+    config: str | Path | Mapping[str, Any] = "panda_table",
+    *,
+    sim: bool | None = None,
+    driver: str | None = None,
+    clock: str | None = None,
+    engine: str | None = None,
+    overrides: Sequence[str] | Mapping[str, Any] = (),
+    pad: str | None = None,
+    viewer: str = "none",
+    console: bool = False,
+    listen: str | None = None,
+    realtime: bool = True,
+) -> Rig:
+    """Open a rig. Nothing moves.
+
+    Args:
+        config: Path of a rig file, name of a built-in rig, or a dict of the same structure.
+        sim: True simulates every device, False makes every device real; None keeps the flags of the rig file.
+        driver: Driver that replaces those of all devices; ``"mock"`` needs no devices and no simulation.
+        clock: ``"real_time"`` or ``"lock_step"``; None keeps that of the rig file.
+        engine: Engine of the simulated world: ``"pybullet"``, ``"mujoco"``, or ``"auto"`` for the first of them that is
+            installed; None keeps that of the rig file. :attr:`~hal.specs.Plan.engine` of :attr:`Rig.plan` names it.
+        overrides: Values for keys of the rig file, as ``KEY=VALUE`` strings or a mapping.
+        pad: Device behind a pad of ``model: auto``: ``auto``, ``evdev``, ``web`` (the console), ``terminal``, ``demo``
+            (a recorded tour), the path of a recording, or ``none`` for no pad.
+        viewer: ``"gui"`` opens a window with the simulated world, ``"3d"`` serves a page with the arms in 3D.
+        console: Serve the console, even if another pad drives.
+        listen: Address and port of the console, ``ADDRESS[:PORT]``; this computer only by default.
+        realtime: Request real-time scheduling (SCHED_FIFO) and locked memory for the servos in real time; if they are
+            refused, :attr:`Rig.notes` has the remedy.
+
+    Returns:
+        The rig; close it, or use it in a ``with`` statement.
+
+    Raises:
+        ConfigError: The rig file is wrong; lists every problem.
+        CommandError: An argument is wrong.
+        DriverMissing: A library is not installed; the message has the command that installs it.
+        DeviceNotFound: No such device.
+        ConnectionLost: A device does not answer.
+        NotSupported: A viewer or a console that this rig cannot have.
+    """
+    from .config import load
+
+    where = Listen.parse(listen)
+    plan = load(config, sim=sim, driver=driver, clock=clock, engine=engine, overrides=overrides).resolve()
+    rig = Rig(plan)
+    try:
+        rig._open(pad=pad, viewer=viewer, console=console, listen=where, realtime=realtime)
+    except BaseException:
+        with contextlib.suppress(Exception):
+            rig.close()
+        raise
+    return rig
 
 
 class Rig:
@@ -80,15 +138,6 @@ class Rig:
     def lock_step(self) -> bool:
         """Whether time stands still until the program waits."""
         return self.plan.clock == "lock_step"
-
-    @contextlib.contextmanager
-    def _close_if_it_fails(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            with contextlib.suppress(Exception):
-                self.close()
-            raise
 
     def _open(self, *, pad: str | None, viewer: str, console: bool, listen: Listen, realtime: bool) -> None:
         plan = self.plan
@@ -440,9 +489,9 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
 
     Args:
         plan: The resolved rig.
-        pad: As in :func:`hal.open`.
-        viewer: As in :func:`hal.open`.
-        console: As in :func:`hal.open`.
+        pad: As in :func:`open_rig`.
+        viewer: As in :func:`open_rig`.
+        console: As in :func:`open_rig`.
 
     Returns:
         The pads to open.

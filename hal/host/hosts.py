@@ -17,7 +17,7 @@ from .. import registry
 from ..commands import StopLatch
 from ..errors import ConnectionLost, HalError
 from ..specs import GripperSpec, GroupSpec, RobotSpec, to_json
-from .process import HOST, STOP_LIMIT, Child, SharedMemory
+from .process import STOP_LIMIT, Child, SharedMemory
 from .records import AppRecord, GroupMemory
 
 if TYPE_CHECKING:
@@ -290,7 +290,7 @@ class RemoteHost(Host):
         config = {"group": to_json(spec), "snapshot_capacity": SNAPSHOT_CAPACITY, "realtime": realtime}
         config["others"] = [to_json(other) for other, _ in others]
         memories = [self.shared, *(memory for _, memory in others)]
-        target = HOST if spec.at is None else "hal.remote.client:main"
+        target = "hal.host.main:main" if spec.at is None else "hal.remote.client:main"
         self.child = Child(spec.name, target, config, memories)
         self._close_by: float | None = None
         """Time at which the process is killed, s; None before it was asked to close."""

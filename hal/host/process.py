@@ -10,7 +10,6 @@ reports when it is ready and then calls :func:`serve`.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import json
 import mmap
@@ -30,17 +29,15 @@ from typing import Any
 from .. import errors
 from ..errors import ConnectionLost, HalError, NotSupported, Problem
 from ..lock import APP_MARK
+from . import records
 
 _BOOT = (
-    "import sys, json, site; fds, path, target, about = json.loads(sys.argv[1]); "
+    "import sys, json, site; fds, path, target, library = json.loads(sys.argv[1]); "
     "sys.path += [p for p in path if p not in sys.path]; site.main(); "
-    "from hal.host.process import child_main; child_main(target, fds, about)"
+    "from hal.host.process import child_main; child_main(target, fds, library)"
 )
 """Program of a child: Python's own modules come first, then the app's path in its order, then what ``site`` adds."""
-HOST = "hal.host.main:main"
-"""What runs in the process of a group of devices."""
-_HOST_NEEDS = ("pinocchio", "coal")
-"""Libraries that such a process needs whenever it has an arm."""
+_OPTIONS = ("-I", "-S", "-u", "-c")
 START_TIMEOUT = 60.0
 """Longest time that a child may take to get ready, s: reading a large mesh for the first time takes a while."""
 REQUEST_TIMEOUT = 30.0
@@ -62,8 +59,9 @@ _IDLE = 0.5
 """s that :func:`serve` waits for a message before it checks that the app is alive."""
 
 
-def _find_library() -> str:
-    return os.path.realpath(os.path.dirname(errors.__file__))
+def _library() -> tuple[str, int]:
+    """Return which copy of this library a process runs: its folder, and the layout of its shared memory."""
+    return os.path.realpath(os.path.dirname(errors.__file__)), records.LAYOUT
 
 
 def _describe_status(status: int) -> str:
@@ -149,20 +147,6 @@ class Channel:
         except OSError as error:
             raise ChannelClosed(f"the other process is gone: {error}") from None
 
-    def send_descriptors(self, fds: Sequence[int]) -> None:
-        """Send open files. Raises ChannelClosed if the other process is gone."""
-        try:
-            socket.send_fds(self._out, [b"\n"], fds)
-        except OSError as error:
-            raise ChannelClosed(f"the other process is gone: {error}") from None
-
-    def receive_descriptors(self) -> list[int]:
-        """Wait for open files, before any message. Raises ChannelClosed if the other process is gone."""
-        data, fds, _, _ = socket.recv_fds(self.sock, 1, 64)
-        if not data:
-            raise ChannelClosed("the other process closed the connection")
-        return fds
-
     def send_if_free(self, message: Any) -> bool:
         """Send one short message unless the other process is behind; never waits. Returns whether it was sent.
 
@@ -238,67 +222,6 @@ def unpack_error(data: dict[str, Any]) -> HalError:
     return error
 
 
-class _Program:
-    """A fresh interpreter that imports what it is to run, and then waits for what a :class:`Child` sends.
-
-    ``modules`` are further ones that it imports before, if they are installed.
-    """
-
-    def __init__(self, target: str, modules: Sequence[str] = ()) -> None:
-        fill_standard_descriptors()
-        self.key = _program_key(target)
-        ours, theirs = socket.socketpair()
-        self.channel = Channel(ours)
-        self.log = tempfile.TemporaryFile()  # noqa: SIM115  # closed by the child's close()
-        task = json.dumps([[theirs.fileno()], self.key[1], target, [_find_library(), modules]])
-        self.process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-u", "-c", _BOOT, task, f"{APP_MARK}{os.getpid()}"],
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            stdout=self.log,
-            stderr=self.log,
-            start_new_session=True,
-        )
-        theirs.close()
-
-
-def _program_key(target: str) -> tuple[int, list[str], str]:
-    """Return what must be the same when a process is prepared and when it is taken."""
-    return os.getpid(), [os.path.abspath(entry) for entry in sys.path], target
-
-
-_prepared: list[_Program] = []  # started before their configuration was known
-
-
-def prepare_host() -> None:
-    """Start the process of a group of devices while its configuration is read: the next :class:`Child` of :data:`HOST`.
-
-    If it is not needed after all, :func:`drop_prepared` ends it.
-    """
-    if not _prepared:
-        _prepared.append(_Program(HOST, _HOST_NEEDS))
-
-
-@atexit.register
-def drop_prepared() -> None:
-    """End the process of :func:`prepare_host` if no :class:`Child` took it."""
-    while (program := _take_prepared(os.getpid())) is not None:
-        program.process.kill()
-        program.process.wait()
-        program.channel.close()
-        program.log.close()
-
-
-def _take_prepared(*key: Any) -> _Program | None:
-    """Return a prepared process whose key begins so."""
-    for program in tuple(_prepared):
-        if program.key[: len(key)] == key:
-            with contextlib.suppress(ValueError):  # another thread took it
-                _prepared.remove(program)
-                return program
-    return None
-
-
 class Child:
     """A process that answers requests and shares memory with this one. Any thread may call any method."""
 
@@ -329,17 +252,26 @@ class Child:
         self._answers: dict[int | None, dict[str, Any]] = {}
         """By the number of the request; ``ready`` and a failure of the process have none."""
         self._waiting: set[int | None] = set()
-        from .records import LAYOUT  # needs numpy, and a process can be prepared before that is imported
-
-        program = _take_prepared(*_program_key(target)) or _Program(target)
-        self.channel, self.process, self._log = program.channel, program.process, program.log
+        fill_standard_descriptors()
+        ours, theirs = socket.socketpair()
+        self.channel = Channel(ours)
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed by close()
+        fds = [theirs.fileno(), *(memory.fd for memory in memories)]
+        path = [os.path.abspath(entry) for entry in sys.path]
+        self.process = subprocess.Popen(
+            [sys.executable, *_OPTIONS, _BOOT, json.dumps([fds, path, target, _library()]), f"{APP_MARK}{os.getpid()}"],
+            pass_fds=fds,
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=self._log,
+            start_new_session=True,
+        )
+        theirs.close()
         self.ready: Any = None
         self._started = self._closing = False
         try:
-            self.channel.send_descriptors([memory.fd for memory in memories])
-            self.channel.send({"layout": LAYOUT, "config": config})
+            self.channel.send(config)
         except ConnectionLost:
-            self._raise_last_error()
             self._wait_end(_REAPED)
             self.check()
             raise
@@ -557,34 +489,27 @@ def _serve_message(
         channel.send({"id": number, **answer}, timeout)
 
 
-def child_main(target: str, fds: Sequence[int], about: Sequence[Any]) -> None:
-    """Run a child: import and call the target, report an error that it raises, end without interpreter tear-down.
+def child_main(target: str, fds: Sequence[int], library: Sequence[Any]) -> None:
+    """Run a child: call the target, report an error that it raises, end without interpreter tear-down.
 
     Args:
         target: ``module:function``.
-        fds: Descriptor of the socket, which brings those of the memories and the configuration.
-        about: The app's copy of this library (another one is refused), and further modules to import, if installed.
+        fds: Descriptors of the socket and of the memories.
+        library: The app's copy of this library; another one is refused.
     """
     channel = Channel(socket.socket(fileno=fds[0]))
     status = 0
     try:
-        own, (library, modules) = _find_library(), about
-        if own != library:
-            text = f"app and servo must be one copy of hal: the app runs {library}, this process {own}"
-            raise NotSupported(text, code="version_mismatch")
+        own = _library()
+        if own != tuple(library):
+            folders = f"the app runs {library[0]}, this process {own[0]}"
+            changed = folders if own[0] != library[0] else f"{own[0]} has changed since the app started"
+            raise NotSupported(f"app and servo must be one copy of hal: {changed}", code="version_mismatch")
+        memories = [SharedMemory(fd=fd) for fd in fds[1:]]
+        config = channel.receive(START_TIMEOUT)
         module, _, function = target.partition(":")
         main: Callable[..., None] = getattr(__import__(module, fromlist=[function]), function)
-        for name in modules:
-            with contextlib.suppress(ImportError):  # its user reports what is missing
-                __import__(name)
-        memories = [SharedMemory(fd=memory) for memory in channel.receive_descriptors()]
-        task: Any = channel.receive(START_TIMEOUT)
-        from .records import LAYOUT
-
-        if task["layout"] != LAYOUT:
-            text = f"app and servo must be one copy of hal: {own} has changed since the app started"
-            raise NotSupported(text, code="version_mismatch")
-        main(channel, memories, task["config"])
+        main(channel, memories, config)
     except ChannelClosed:
         pass
     except KeyboardInterrupt:

@@ -29,8 +29,7 @@ from ..deadman import Deadman
 from ..errors import CommandError, DriverMissing, MotionStopped, NotSupported, RobotFault
 from ..geometry import Pose, apply_rotation
 from ..observation import Observation
-from ..opening import open_rig
-from ..rig import Rig
+from ..rig import Rig, open_rig
 from ..robot import Robot
 from .episode import reset_scene, stands_in_world
 

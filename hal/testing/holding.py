@@ -12,8 +12,7 @@ from ..commands import Twist
 from ..errors import NotSupported
 from ..geometry import Pose
 from ..gripper import Gripper
-from ..opening import open_rig
-from ..rig import Rig
+from ..rig import Rig, open_rig
 from ..robot import Robot
 from ..specs import BodySpec
 

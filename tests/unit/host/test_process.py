@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from hal.errors import ConfigError, ConnectionLost, MotionStopped, NotSupported, Problem
-from hal.host import process
 from hal.host.process import Channel, Child, SharedMemory, pack_error, unpack_error
 
 HERE = Path(__file__).parents[2] / "kits"
@@ -156,33 +155,6 @@ def test_a_busy_receiver_loses_only_messages_that_may_be_lost() -> None:
     with pytest.raises(ConnectionLost):
         sender.send_if_free({"frame": 0})
     sender.close()
-
-
-def children() -> set[int]:
-    return {int(pid) for task in Path("/proc/self/task").iterdir() for pid in (task / "children").read_text().split()}
-
-
-def test_a_prepared_process_is_used_once_with_the_same_path_and_is_not_left_behind(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(process, "HOST", "child_targets:echo")
-    before = children()
-    process.prepare_host()
-    process.prepare_host()
-    (prepared,) = children() - before
-    first, second = start(), start()
-    assert first.process.pid == prepared
-    assert second.process.pid != prepared
-    first.close()
-    second.close()
-    process.prepare_host()
-    monkeypatch.syspath_prepend(str(tmp_path))
-    (prepared,) = children() - before
-    third = start()
-    assert third.process.pid != prepared
-    third.close()
-    process.drop_prepared()
-    assert children() == before
 
 
 PROGRAM = """
