@@ -12,15 +12,15 @@ class _Choice:
     """As draccus.ChoiceRegistry: configurations by name."""
 
     id: str | None = None
-    choices: ClassVar[dict[str, Any]] = {}
+    choices: ClassVar[dict[tuple[type, str], Any]] = {}
 
     @classmethod
     def register_subclass(cls, name: str) -> Any:
-        return lambda subclass: cls.choices.setdefault(name, subclass)
+        return lambda subclass: cls.choices.setdefault((cls, name), subclass)
 
     @classmethod
     def get_choice_class(cls, name: str) -> Any:
-        return cls.choices[name]
+        return cls.choices[cls, name]
 
 
 def _make_robot(config: Any) -> Any:

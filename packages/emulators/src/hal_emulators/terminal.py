@@ -29,6 +29,7 @@ class PseudoTerminal:
     def open(self) -> None:
         """Offer it. Raises OSError."""
         self._ends = os.openpty()  # while its other end is open here too, it outlives its clients
+        os.set_blocking(self._ends[0], False)
         self.descriptors = [self._ends[0]]
         tty.setraw(self._ends[1])
         self._link.unlink(missing_ok=True)

@@ -64,7 +64,7 @@ def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader
         ("register 3 3 1234", "elbow_flex (motor 3): is of the model 1234"),
         ("register 6 11 4095", "the lever (motor 6): its range is"),
         ("silent 4 on", "no answer from wrist_flex (motor 4)"),
-        ("unplug on", "servo bus: "),
+        ("unplug on", "no SO-101 leader at "),
     ],
 )
 def test_what_is_no_leader_is_refused_by_name(
