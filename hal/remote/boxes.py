@@ -14,6 +14,14 @@ from ..host.records import GripperAct, GripperMail, GroupMemory, RobotMail
 _DOUBLE = struct.Struct("<d")
 
 
+def _time(record: bytearray, place: int) -> float:
+    """Return a time of a record. Raises ValueError for NaN, which would never grow old."""
+    t: float = _DOUBLE.unpack_from(record, place)[0]
+    if math.isnan(t):
+        raise ValueError("a time that is not a number")
+    return t
+
+
 class Box:
     """One kind of record: read from mailboxes at one end, and written into mailboxes at the other.
 
@@ -64,7 +72,7 @@ class Box:
         if len(record) != self._mailboxes[0].record_size:
             raise ValueError(f"a record of {len(record)} bytes in place of {self._mailboxes[0].record_size}")
         for place in self._past:
-            t = float(_DOUBLE.unpack_from(record, place)[0])
+            t = _time(record, place)
             if t > 0.0:
                 _DOUBLE.pack_into(record, place, min(t + shift, now))
         if self._check is not None:
@@ -109,7 +117,7 @@ class CommandBox(Box):
             raise ValueError("a command with too many numbers")
         if chunk and rest:
             self._mail.put_chunk(struct.unpack_from("<Q", rest)[0], array("d", bytes(rest[8:])))
-        deadline = float(_DOUBLE.unpack_from(record, self._DEADLINE)[0]) + shift
+        deadline = _time(record, self._DEADLINE) + shift
         most = now + (CHUNK_AHEAD if chunk else self._most_ahead)
         _DOUBLE.pack_into(record, self._DEADLINE, min(deadline, most))
         super()._write(record, shift, now)

@@ -225,6 +225,18 @@ def test_frames_that_make_no_sense_end_the_link(ends: Ends, change: Any) -> None
     assert ends.served.get_command() is None
 
 
+@pytest.mark.parametrize("of", ["command", "deadline", "deadman", "program"])
+def test_a_time_that_is_no_number_ends_the_link(ends: Ends, of: str) -> None:
+    if of == "deadman":
+        ends.arm.put_deadman(DeadmanRecord(True, True, 1, math.nan))
+    elif of == "program":
+        ends.memories[0].app.write(math.nan, 0)
+    else:
+        ends.arm.put_command(_command(1)._replace(**{"t" if of == "command" else "deadline": math.nan}))
+    with raises_code(ConnectionLost, "bad_frame"):
+        ends.exchange()
+
+
 def test_a_silent_end_is_gone(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     later = time.monotonic() + 2.1
     monkeypatch.setattr(time, "monotonic", lambda: later)
