@@ -62,7 +62,7 @@ def test_nothing_is_imported_before_its_first_use() -> None:
 
 
 def test_an_unknown_driver_lists_the_drivers_and_the_nearest_spelling() -> None:
-    with pytest.raises(DeviceNotFound, match=r"did you mean 'pybullet'\?.*dynamixel, evdev, feetech, franka, mock"):
+    with pytest.raises(DeviceNotFound, match=r"did you mean 'pybullet'\?.*evdev, feetech, franka, .*mock"):
         registry.load("pybulet", "robot")
 
 
