@@ -106,8 +106,9 @@ class XArm(RobotDriver):
             self._reports.retry()
         if silent or now - link.silent_since > _SILENCE or not link.connected or self._last is None:
             raise self._lose()
+        if self.engaged or self._lost:  # the first reports after a loss may be late, and show the end of our own motion
+            self._t_ours = now
         self._lost = False
-        self._t_ours = now if self.engaged else self._t_ours
         fault = self._judge(now)
         # Reports are of 100 Hz and have no set-point: while they are sent, the last one that was sent is reported.
         taken = link.sent if self.engaged else None

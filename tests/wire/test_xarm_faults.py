@@ -84,7 +84,8 @@ def test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover(
     if end:
         emulator.control.send(end)
     recover(rig, arm)
-    assert abs(arm.move_to(arm.home, unattended=True, speed=0.3).q - arm.home).max() < 2e-3
+    arm.move_to(arm.home, unattended=True, speed=0.3)
+    wait_until(lambda: abs(arm.state().q - arm.home).max() < 2e-3)
 
 
 def test_an_answer_that_is_late_stops_the_arm_and_no_set_point_jumps(rig: hal.Rig, emulator: XArmEmulator) -> None:
