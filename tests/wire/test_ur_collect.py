@@ -68,8 +68,9 @@ class Operator(io.StringIO):
         time.sleep(1.0)
         self.pad.press("l1")
         time.sleep(1.0)
-        self.pad.set(axes={"dpad_y": 0.0}, buttons=())
+        self.pad.set(axes={"dpad_y": 0.0}, buttons=("l2",))
         time.sleep(0.5)
+        self.pad.release("l2")
         self.tap("home")
 
 
@@ -97,7 +98,7 @@ def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
             monkeypatch.context() as patched,
         ):
             patched.setattr(hal, "open", open_rig)
-            words = ["--speed", "0.3", "--out", data, "--episodes", "1", "--task", "reach"]
+            words = ["--speed", "0.1", "--out", data, "--episodes", "1", "--task", "reach"]
             assert collect.main([*options, *words]) == 0, person.getvalue()
         (episode,) = Dataset(data).episodes
         for name in ports:
