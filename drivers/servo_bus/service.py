@@ -6,6 +6,7 @@ Calibration is LeRobot's: what is stored in the motors, and the file, can be exc
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from time import monotonic
 from typing import Any, NamedTuple
 
@@ -21,6 +22,8 @@ from .protocol import ALL, COUNT, PING, TURN, Calibration
 
 _WHOLE = 5.5
 """Range of a joint in the model from which its motor is given a whole turn, rad, as LeRobot does."""
+_UNKNOWN = 0.5, 5.0
+"""Least and greatest range of a motor that has none in the model, a gripper's, rad, before :data:`SPANS`."""
 _SCAN = 0.1
 """Time in which all motors on the bus answer, s."""
 
@@ -62,12 +65,17 @@ class MotorService:
         self.pose = "to the middle of its range" if zero is None else "to where the model has its 0"
         self.seen: dict[int, tuple[int, int]] = {}
         self._offsets: dict[int, int] = {}
+        self._before: dict[int, Calibration] = {}
+        """How the motors were calibrated, until they are calibrated anew."""
 
     def __enter__(self) -> MotorService:
         self.bus = ServoBus.acquire(self.settings.port, self.protocol, self.settings.baud)
         return self
 
     def __exit__(self, *_: object) -> None:
+        with suppress(ConnectionLost):
+            for id, calibration in self._before.items():  # what was begun did not come to its end
+                self._write(id, calibration)
         self.bus.release(())
 
     # Ids and rates.
@@ -112,7 +120,11 @@ class MotorService:
     # Homing and ranges.
 
     def relax(self) -> None:
-        """Switch the torque of all motors off, and forget how they are calibrated. Raises ConnectionLost."""
+        """Switch the torque of all motors off, and let them turn freely. Raises ConnectionLost.
+
+        Unless they are calibrated anew before the service ends, they then have their calibration again.
+        """
+        self._before = {motor.id: self._read_calibration(motor.id) for motor in self.motors}
         for motor in self.motors:
             self._store(motor.id, self.protocol.torque, b"\0")
             self._write(motor.id, Calibration(0, 0, 0, TURN - 1))
@@ -135,7 +147,7 @@ class MotorService:
         """Store the ranges that were seen in the motors, and return LeRobot's file.
 
         Raises:
-            ConfigError: A joint was not moved through its range; names each, and nothing is stored.
+            ConfigError: A motor was not moved through its range; names each, and nothing is stored.
             ConnectionLost: A motor does not answer.
         """
         found, problems = {}, []
@@ -144,10 +156,12 @@ class MotorService:
             if motor.span > _WHOLE:
                 low, high = 0, TURN - 1
             span = (high - low) * COUNT
-            if not (span if motor.span == 0.0 else SPANS[0] * motor.span) <= span <= SPANS[1] * (motor.span or 5.0):
-                message = f"was moved through {span:.2f} rad, {motor.span:.2f} are in the model; begin again"
+            least, most = (share * (motor.span or _UNKNOWN[k]) for k, share in enumerate(SPANS))
+            if not least <= span <= most:
+                message = f"was moved through {span:.2f} rad, not {least:.2f} to {most:.2f}; begin again"
                 problems.append(Problem("<motors>", motor.name, message, "not_calibrated"))
-            found[motor.name] = Calibration(self._read_drive_mode(motor.id), self._offsets[motor.id], low, high)
+            mode = self._read_calibration(motor.id).drive_mode
+            found[motor.name] = Calibration(mode, self._offsets[motor.id], low, high)
         if problems:
             raise ConfigError(problems)
         self.restore({motor.name: {"id": motor.id, **found[motor.name]._asdict()} for motor in self.motors})
@@ -163,6 +177,7 @@ class MotorService:
             entry = entries[motor.id]
             self._store(motor.id, self.protocol.torque, b"\0")
             self._write(motor.id, Calibration(*(int(entry[key]) for key in Calibration._fields)))
+        self._before = {}
 
     # Registers.
 
@@ -176,11 +191,11 @@ class MotorService:
             raise ConnectionLost(f"no answer from {', '.join(silent)}; check plugs and power supply")
         return {id: self.protocol.decode_position(answer.data) for id, answer in answers.items()}
 
-    def _read_drive_mode(self, id: int) -> int:
+    def _read_calibration(self, id: int) -> Calibration:
         block = self.bus.read(id, *self.protocol.stored)
         if block is None:
             raise ConnectionLost(f"no answer from motor {id}")
-        return self.protocol.decode_registers(block).calibration.drive_mode
+        return self.protocol.decode_registers(block).calibration
 
     def _write(self, id: int, calibration: Calibration) -> None:
         self._unlock(id, True)

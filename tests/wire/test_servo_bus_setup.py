@@ -102,3 +102,21 @@ def test_an_arm_is_calibrated_by_hand_and_its_file_restores_it(
     answer(monkeypatch, lambda: None)
     assert calibrate.main(["arm", *options(far, "--restore", str(file))]) == 0
     assert read() == pytest.approx(before, abs=3e-3)
+
+
+def test_a_motor_that_was_not_moved_is_named_and_all_keep_their_calibration(
+    far: SteppedServos, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    protocol = far.arm.protocol
+
+    def stored() -> list[Any]:
+        at, size = protocol.stored
+        return [protocol.decode_registers(bytes(one.registers[at : at + size])).calibration for one in far.arm.servos]
+
+    before = stored()
+    answer(monkeypatch, *[lambda: None] * 3)
+    assert calibrate.main(["arm", *options(far, "--out", str(tmp_path / "arm.json"))]) == 2
+    told = capsys.readouterr().err
+    assert all(f"{name}: was moved through 0.00 rad" in told for name in (far.spec.joints[1], "gripper"))
+    assert stored() == before
+    assert not list(tmp_path.iterdir())
