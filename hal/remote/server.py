@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..auth import is_loopback
 from ..commands import Session
 from ..errors import CommandError, ConnectionLost, ControlTaken, HalError, NotSupported
 from ..host.hosts import RemoteHost, make_groups, start_processes
@@ -20,14 +19,14 @@ from ..host.process import pack_error
 from ..host.records import GripperMail, RobotMail
 from ..specs import Plan, RobotSpec, to_json
 from .boxes import boxes_of_hosts, boxes_of_program
+from .entrance import Entrance
 from .link import CLOSE_LIMIT, MOST_ROUND_TRIP, RigLink, describe_version
+from .measure import echo
 
 PERIOD = 0.002
 """Longest time from a new state to its frame, s."""
 _LEAVING = 1.0
 """Longest wait for a client that is about to leave, s."""
-_HANDSHAKES = 16
-"""Number of connections that may be about to say what they want; more are closed at once."""
 
 
 class Served:
@@ -134,6 +133,8 @@ class Served:
     def _request(self, method: str, params: dict[str, Any]) -> Any:
         if method in ("warnings", "reset_statistics", "statistics"):
             results = [host.request(method) for host in self.hosts]
+            if method == "reset_statistics":
+                self.link.offset.forget_round_trips()
             if method == "warnings":
                 return [text for result in results for text in result]
             return self._merge_statistics(results) if method == "statistics" else None
@@ -166,6 +167,7 @@ class Served:
             merged[key] = {name: value for result in results for name, value in result[key].items()}
         offset = self.link.offset
         merged["link"] = {"round_trip_s": offset.round_trip, "offset_s": offset.value, "frames": self.link.frames}
+        merged["link"]["round_trips_s"] = offset.round_trips.summary()
         return merged
 
     def _close(self) -> None:
@@ -186,18 +188,13 @@ class Server:
         report: Called with each line that a user should see.
 
     Raises:
-        NotSupported: An address that other computers reach (``code`` is ``no_certificates``), or a rig in lock-step
-            (``needs_real_time``).
+        NotSupported: An address other than 127.0.0.1, ::1 and localhost without a certificate (``code`` is
+            ``no_certificates``, or see :func:`~hal.keys.find_key`), or a rig in lock-step (``needs_real_time``).
         CommandError: There is no arm (``code`` is ``no_robot``), or the port is taken (``bad_address``).
     """
 
     def __init__(self, plan: Plan, address: str, port: int, report: Callable[[str], object]) -> None:
-        if not is_loopback(address):
-            raise NotSupported(
-                f"{address} can be reached from other computers, and connections are not encrypted or authenticated "
-                "yet: listen at 127.0.0.1, and let the other computer come through `ssh -L`",
-                code="no_certificates",
-            )
+        self.entrance = Entrance(address, report)
         if plan.clock == "lock_step":
             raise NotSupported("a served rig needs real time; leave out the clock lock_step", code="needs_real_time")
         far = [robot.name for robot in plan.robots if robot.at is not None]
@@ -211,7 +208,6 @@ class Server:
         self._over = threading.Event()
         self.served: Served | None = None
         """The devices of the client that has them; None while there is none."""
-        self._waiting = threading.Semaphore(_HANDSHAKES)
         try:
             self._socket = socket.create_server(
                 (address, port), family=socket.AF_INET6 if ":" in address else socket.AF_INET
@@ -240,10 +236,9 @@ class Server:
                     if self._over.is_set():
                         return
                     raise
-                if not self._waiting.acquire(blocking=False):
-                    sock.close()
-                    continue
-                thread = threading.Thread(target=self._welcome, args=(sock, f"{peer[0]}:{peer[1]}"), daemon=True)
+                at = f"{peer[0]}:{peer[1]}"
+                self.entrance.enter(at, sock)
+                thread = threading.Thread(target=self._welcome, args=(sock, at), daemon=True)
                 thread.start()
                 threads = [other for other in threads if other.is_alive()] + [thread]
         finally:
@@ -254,21 +249,18 @@ class Server:
 
     def _welcome(self, sock: socket.socket, peer: str) -> None:
         """Serve one connection, in a thread of its own."""
-        link = RigLink(sock, peer, PERIOD)
+        link = None
         try:
-            try:
-                wish = link.await_message()
-            finally:
-                self._waiting.release()
-            self._serve(link, peer, wish)
-        except ConnectionLost as error:
-            self._report(f"{peer}: {error}")
+            link = self.entrance.admit(sock, peer, PERIOD)
+            self._serve(link, peer, link.await_message())
         except HalError as error:
-            self._report(f"{peer} is refused: {error}")
+            self.entrance.report(peer, error)
         except Exception:
             self._report(f"{peer}: {traceback.format_exc()}")
         finally:
-            link.close()
+            self.entrance.leave(peer)
+            if link is not None:
+                link.close()
 
     def _serve(self, link: RigLink, peer: str, wish: dict[str, Any]) -> None:
         try:
@@ -276,19 +268,25 @@ class Server:
             if wish["want"] == "robots":
                 link.say_last(describe_robots(self._plan.robots))
                 return
+            if wish["want"] == "echo":
+                echo(link, self._over)
+                return
             self._take()
         except HalError as error:
             link.say_last({"error": pack_error(error)})
             raise
         try:
+            self.entrance.leave(peer)
             link.post({"accepted": True})
-            self._report(f"{peer} has taken {', '.join(name for name, _ in wish['robots'])}")
+            self._report(f"{link.at} has taken {', '.join(name for name, _ in wish['robots'])}")
             self.served = Served(self._plan, link, wish, self._over)
             self.served.run()
+        except ConnectionLost as error:
+            self._report(f"{link.at}: {error}")
         finally:
             self.served = None
             self._lease.release()
-            self._report(f"{peer} has left; the devices are closed")
+            self._report(f"{link.at} has left; the devices are closed")
 
     def _take(self) -> None:
         """Take the lease. Raises ControlTaken while another connection has it."""

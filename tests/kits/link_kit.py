@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from waiting import wait_until
@@ -20,6 +21,7 @@ from hal.config import load
 from hal.host.records import RobotMail, ServoRecord
 from hal.remote.server import Server
 
+ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import json, select, sys, time
 import hal
@@ -57,6 +59,15 @@ with hal.open({"robots": {"panda": {"at": sys.argv[1]}}}, pad="none") as rig:
 """
 """Drives the arm until it is told to end, holding its dead-man; says each stop."""
 _HEADER = struct.Struct("<IQddd")
+
+
+def start_server(listen: str = "127.0.0.1:0") -> tuple[subprocess.Popen[str], str]:
+    """Start ``hal serve --sim``; return its process and its address."""
+    run = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", listen]
+    server = subprocess.Popen([*run, "--set", "cameras={}"], stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    line = next(line for line in server.stdout if line.startswith("listening at "))
+    return server, line.removeprefix("listening at ").partition(",")[0]
 
 
 class DrivingProgram:
