@@ -424,8 +424,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _link(at: str, duration: float, as_json: bool) -> int:
+    from hal.remote.client import split_address
     from hal.remote.measure import judge_link, measure_link, plot
 
+    try:
+        split_address(at)
+    except ValueError:
+        raise CommandError(f"--at takes ADDRESS[:PORT], not {at!r}", code="bad_address") from None
     link = measure_link(at, duration)
     if as_json:
         found = list(judge_link(link))

@@ -59,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
     for name in args.person:
         print(make_key("person", name, (), args.days))
     for name in revokes:
-        print(f"{name} is revoked for every host that has this list, from a second later on: copy it to {revoke(name)}")
+        print(f"{name} is revoked where this list is; copy it into the same folder of each host: {revoke(name)}")
     if args.action == "list":
         today = time.strftime("%Y-%m-%d", time.gmtime())
         for line in read_list():

@@ -134,13 +134,13 @@ def _is_address(word: str) -> bool:
     return False
 
 
-def read_list() -> list[Certificate]:
-    """Return the certificates that were made, as far as this computer knows them; empty without a list.
+def read_list(folder: Path | None = None) -> list[Certificate]:
+    """Return the certificates that were made, as far as this folder has a list; by default :func:`keys_folder`.
 
     Raises:
         CommandError: The list cannot be read (code ``bad_key_list``).
     """
-    file, found = keys_folder() / LIST, []
+    file, found = (folder or keys_folder()) / LIST, []
     try:
         lines = file.read_text().splitlines()
     except FileNotFoundError:
@@ -267,7 +267,7 @@ class Credentials:
             ConnectionLost: It was revoked (code ``certificate_revoked``) or has expired (``certificate_expired``).
         """
         name = next(value for part in certificate["subject"] for key, value in part if key == "commonName")
-        if any(line.revoked and line.serial == certificate["serialNumber"] for line in read_list()):
+        if any(line.revoked and line.serial == certificate["serialNumber"] for line in read_list(self.file.parent)):
             text = f"the certificate of {name} is revoked, {at} is refused: `hal keys make` makes a new one"
             raise ConnectionLost(text, code="certificate_revoked")
         if time.time() > ssl.cert_time_to_seconds(certificate["notAfter"]):

@@ -187,6 +187,10 @@ class PolicyClient:
                 raise PolicyError(str(lost), code=lost.code) from error
             cause = getattr(error, "os_error", None)  # of aiohttp, whose own text has its parameters
             reason = (cause and cause.strerror) or str(error) or "no answer"
+            if self._credentials is not None and isinstance(error, (aiohttp.ServerDisconnectedError, ConnectionError)):
+                reason += f" after the handshake. Has {self._credentials.file} expired, or another authority?"
+            elif self._credentials is None and self.url.startswith("wss:"):
+                reason += "; this user has no certificate of `hal keys`"
             raise PolicyError(f"no policy server at {self.url}: {reason}", code="policy_unreachable") from error
         self._listen()
         metadata = await self._receive(CONNECT_TIMEOUT)
@@ -413,9 +417,12 @@ def _aiohttp() -> Any:
 
 def _find_tls_error(error: BaseException | None) -> ssl.SSLError | None:
     """Return the error of TLS that is behind one of aiohttp."""
-    while error is not None and not isinstance(error, ssl.SSLError):
-        error = getattr(error, "certificate_error", None) or getattr(error, "os_error", None) or error.__cause__
-    return error
+    while error is not None:
+        deeper = getattr(error, "certificate_error", None) or getattr(error, "os_error", None) or error.__cause__
+        if isinstance(error, ssl.SSLError) and deeper is None:
+            return error
+        error = deeper
+    return None
 
 
 def _server_error(text: str) -> PolicyError:

@@ -171,7 +171,7 @@ def test_a_computer_without_openssl_says_what_to_install(tmp_path: Path, monkeyp
     [
         ("host", "person", None),
         ("host", "foreign person", "certificate_foreign"),
-        ("host", "expired person", "certificate_expired"),
+        ("host", "expired person", "policy_unreachable"),
         ("foreign host", "person", "certificate_foreign"),
         ("other host", "person", "certificate_wrong_name"),
         ("revoking host", "person", "policy_error"),
