@@ -14,6 +14,7 @@ program and host each see memory of their own computer, and nothing above or bel
 * :mod:`.client`: the process in place of a host. It starts, answers, fails and ends as a host's process does.
 * :mod:`.server`: opens the hosts of its rig for a client, and closes them, at rest, when that client leaves. So each
   client finds hosts without a past, and coming back is like starting the program again: nothing resumes.
+* :mod:`.entrance`: who is let in, with which certificate (:mod:`hal.keys`). :mod:`.measure`: what a link is good for.
 
 **The dead-man is end to end.** The server never makes a sign of life. That of the program (its heartbeat, the stamp of
 the dead-man) is translated by the middle of the bounds that the exchanged stamps prove for the offset of the clocks, so
