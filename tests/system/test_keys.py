@@ -25,7 +25,7 @@ from hal.remote.client import split_address
 
 pytestmark = pytest.mark.slow
 ADDRESS = "127.0.0.2"
-STRANGERS = 300
+STRANGERS = 100
 """Connections of an intruder at the same time."""
 
 
