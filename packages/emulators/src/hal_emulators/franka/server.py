@@ -300,7 +300,7 @@ class ArmServer:
 
     def _waits_for_answers(self) -> bool:
         motion = self.arm.motion
-        if not self.pacing.lockstep or motion is None or motion.options.asynchronous:
+        if not self.pacing.lockstep or motion is None:
             return False
         return not motion.waiting or motion.states_shown >= _STATES_BEFORE
 
@@ -375,7 +375,7 @@ class ArmServer:
         """Return whether a command answers the last state; a motion's first command may answer any of its states."""
         motion = self.arm.motion
         assert motion is not None
-        if motion.waiting or motion.options.asynchronous:
+        if motion.waiting:
             return command.message_id > motion.begun_at
         return command.message_id == self.arm.message_id
 
