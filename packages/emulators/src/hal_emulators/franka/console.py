@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from hal.drivers.franka.flags import flag_index
-from hal_emulators.control import read_switch, read_words
+from hal_emulators.control import read_number, read_switch, read_words
 
 from .faults import COMMANDS, help_text
 from .journal import Counters
@@ -95,10 +95,7 @@ class Executor:
         reports.lag = int(word)
 
     def _report_noise(self, words: Words) -> None:
-        (word,) = _exactly(words, 1)
-        if not 0.0 <= float(word) <= 1.0:
-            raise ValueError("takes 0 to 1 rad")
-        self._server.arm.reports.noise = float(word)
+        self._server.arm.reports.noise = read_number(*_exactly(words, 1), 0.0, 1.0)
 
     def _report_measured(self, words: Words) -> None:
         self._server.arm.reports.measured = read_switch(*_exactly(words, 1))
@@ -175,8 +172,4 @@ def _exactly(words: Words, count: int) -> Words:
 
 
 def _seconds(words: Words) -> float:
-    (word,) = _exactly(words, 1)
-    seconds = float(word)
-    if not 0.0 <= seconds <= _MAX_DURATION:
-        raise ValueError(f"takes 0 to {_MAX_DURATION:g} seconds")
-    return seconds
+    return read_number(*_exactly(words, 1), 0.0, _MAX_DURATION)

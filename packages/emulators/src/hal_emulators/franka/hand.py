@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from hal_emulators.control import read_switch
+from hal_emulators.control import read_number, read_switch
 from hal_emulators.shared_world import ArmInWorld
 
 from .hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
@@ -71,14 +71,6 @@ class HandFaults:
     """Delay of every answer, s."""
     failures: int = 0
     """Number of motions that fail from now on."""
-
-
-def number(word: str, least: float = 0.0, most: float = 1e6) -> float:
-    """Return a word as a number in a range. Raises ValueError if it is not."""
-    value = float(word)
-    if not least <= value <= most:
-        raise ValueError(f"must be a number in {least:g}..{most:g}, not {word}")
-    return value
 
 
 # The hand.
@@ -190,7 +182,7 @@ class HandServer:
     def _do_object(self, width: str) -> None:
         if self._world is not None:
             raise ValueError("the fingers meet the objects of the simulated world: use rig.world")
-        self.fingers.put(None if width == "none" else number(width, 1e-6, FULL_WIDTH))
+        self.fingers.put(None if width == "none" else read_number(width, 1e-6, FULL_WIDTH))
 
     def _do_grasp_ends_at_width(self, word: str) -> None:
         self.fingers.grasp_ends_at_width = read_switch(word)
@@ -205,25 +197,25 @@ class HandServer:
         self.faults.stop_releases = read_switch(word)
 
     def _do_silence(self, seconds: str) -> None:
-        self.faults.silent_until = time.monotonic() + number(seconds)
+        self.faults.silent_until = time.monotonic() + read_number(seconds, 0.0, 1e6)
 
     def _do_slow_reply(self, seconds: str) -> None:
-        self.faults.slow_reply = number(seconds)
+        self.faults.slow_reply = read_number(seconds, 0.0, 1e6)
 
     def _do_fail(self, times: str = "1") -> None:
-        self.faults.failures = int(number(times))
+        self.faults.failures = int(read_number(times, 0.0, 1e6))
 
     def _do_version(self, version: str) -> None:
-        self.faults.version = int(number(version, 0, 65535))
+        self.faults.version = int(read_number(version, 0, 65535))
 
     def _do_temperature(self, degrees: str) -> None:
-        self.faults.temperature = int(number(degrees, 0, 65535))
+        self.faults.temperature = int(read_number(degrees, 0, 65535))
 
     def _do_drop(self) -> None:
         self._network.disconnect()
 
     def _do_restart(self, seconds: str = _RESTART) -> None:
-        self._back_at = time.monotonic() + number(seconds)
+        self._back_at = time.monotonic() + read_number(seconds, 0.0, 1e6)
         self._network.shut()
         self._running = None
         self.fingers.switch_off()
