@@ -107,6 +107,7 @@ def serve_prompt(execute: Execute) -> None:
                         flush=True,
                     )
 
+    signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # in the background: reading a terminal would stop this program
     threading.Thread(target=serve, name="prompt", daemon=True).start()
 
 
@@ -117,10 +118,10 @@ class CommandPort:
         number: The port.
     """
 
-    def __init__(self, execute: Execute, number: int = 0) -> None:
+    def __init__(self, execute: Execute, number: int = 0, host: str = "127.0.0.1") -> None:
         """Listen on a port, 0 for a free one. Raises OSError if it is taken."""
         self._execute = execute
-        self._listener = socket.create_server(("127.0.0.1", number))
+        self._listener = socket.create_server((host, number))
         self.number: int = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, name="control-port", daemon=True).start()
 
