@@ -491,6 +491,8 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
         return 130
     finally:
         link.disabled = before
+        if argv is None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # a further Ctrl-C would be a traceback of Python's own end
 
 
 def _report_failure(message: str) -> int:
