@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from .types import RobotState
 
 Array = NDArray[np.float64]
-_STILL = 1e-3
-"""Speed of every joint's set-point below which the arm counts as at rest, rad/s."""
+_STILL, _SAME = 1e-3, 1e-9
+"""Speed of every joint's set-point below which the arm counts as at rest, rad/s, if the set-point is the same, rad, as
+in the state before: one that turns back is slow for a moment."""
 _REACH = 0.999
 """Share of the arm's reach that a pose may have."""
 STATE_AGE = 2.0
@@ -70,11 +71,13 @@ class LeaderTeleop(Teleop):
             message = f"{leader.name} has {len(self.spec.joints)} joints, {robot.name} {robot.n}"
             raise CommandError(message, code="cannot_lead")
         self._anchor: _Anchor | None = None
+        self._before: RobotState | None = None
+        """State of the turn before, while it is about to engage."""
 
     def reset(self) -> None:
         """Disengage: the arm stays where it is until it follows commands and is at rest, and the button is pressed."""
         super().reset()
-        self._anchor = None
+        self._anchor = self._before = None
 
     def prepare_takeover(self) -> None:
         """Engage by the mapping's ``take_over`` instead of the dead-man. Raises CommandError if there is none."""
@@ -104,12 +107,19 @@ class LeaderTeleop(Teleop):
         grip = self._grip(pad)
         state = self.robot.state(STATE_AGE)
         if not (pad.joints and pad.pressed(self.button) and state.status is RobotStatus.FOLLOWING):
-            self._anchor = None
-        elif self._anchor is None and np.abs(state.dq_set).max() < _STILL:
+            self._anchor = self._before = None
+        elif self._anchor is None and self._rests(state):
             self._anchor = self._make_anchor(pad.joints, state)
         if self._anchor is None:
             return JointVelocity(np.zeros(self.robot.n)), grip
         return self._anchor.follow(np.array(pad.joints), dt), grip
+
+    def _rests(self, state: RobotState) -> bool:
+        """Return whether the set-point is at rest, by this state and the newest one before it."""
+        before, self._before = self._before, state
+        if before is None or state.stamp.t <= before.stamp.t:
+            return False
+        return bool(np.abs(state.dq_set).max() < _STILL and np.abs(state.q_set - before.q_set).max() < _SAME)
 
     def _make_anchor(self, joints: tuple[float, ...], state: RobotState) -> _Anchor:
         if self._kinematics is not None:

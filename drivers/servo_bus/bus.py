@@ -10,6 +10,7 @@ import select
 import termios
 import threading
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -25,6 +26,17 @@ _PATIENCE = 2.0
 """Longest time to wait for another program to release the port, s."""
 _RETRY = 0.25
 """Time between two tries to open a lost port, s."""
+_ADAPTERS = Path("/sys/bus/usb-serial/devices")
+"""Where Linux keeps what it knows about serial adapters."""
+
+
+def find_latency(port: str) -> tuple[int, str]:
+    """Return for how long an FTDI adapter collects answers, ms, and how to end that; 0 for another one."""
+    timer = _ADAPTERS / Path(port).resolve().name / "latency_timer"
+    try:
+        return int(timer.read_text()), f"echo 1 | sudo tee {timer}"
+    except (OSError, ValueError):
+        return 0, ""
 
 
 class ServoBus:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, Problem, RobotFault
 
-from .bus import ServoBus
+from .bus import ServoBus, find_latency
 from .protocol import COUNT, PING, TURN, Calibration, MotorState, Registers, ServoProtocol
 from .settings import ServoSettings
 
@@ -53,6 +53,7 @@ class Chain:
 
     Attributes:
         registers: What the first motor of each joint has stored.
+        stored: What each motor has stored, by id.
         labels: The joints in words.
         motors: The motors in words, by id.
     """
@@ -69,7 +70,7 @@ class Chain:
         ]
         self.ids = tuple(self.motors)
         self.bus: ServoBus | None = None
-        self._stored: dict[int, Registers] = {}
+        self.stored: dict[int, Registers] = {}
         self.lost: ConnectionLost | None = None
         self._opened, self._t_identified = 0, -inf
         self._t_heard: dict[int, float] = {}
@@ -78,7 +79,7 @@ class Chain:
 
     @property
     def registers(self) -> list[Registers]:
-        return [self._stored[joint.ids[0]] for joint in self.joints]
+        return [self.stored[joint.ids[0]] for joint in self.joints]
 
     def open(self) -> None:
         """Open the bus, and check every motor. Nothing moves, and nothing is written.
@@ -119,12 +120,12 @@ class Chain:
         unread = [self.motors[id] for id, block in blocks.items() if block is None]
         if unread:
             raise DeviceNotFound(f"{self.name}: {', '.join(unread)} answers no question; check its cable")
-        self._stored = {id: self.protocol.decode_registers(block) for id, block in blocks.items() if block is not None}
+        self.stored = {id: self.protocol.decode_registers(block) for id, block in blocks.items() if block is not None}
         problems = [
             Problem("<rig>", f"{self.name}.real", f"{self.motors[id]}: {message}", code)
             for joint in self.joints
             for id in joint.ids
-            for message, code in self._check_registers(id, joint, self._stored[id])
+            for message, code in self._check_registers(id, joint, self.stored[id])
         ]
         if problems:
             raise ConfigError(problems)
@@ -210,7 +211,7 @@ class Chain:
             self.lost = self._silence(bus, silent)
             raise self.lost
         self.lost = None
-        found = {id: self._count_turns(states[id], self._stored[id], id) for id in self.ids}
+        found = {id: self._count_turns(states[id], self.stored[id], id) for id in self.ids}
         return [_merge([found[id] for id in joint.ids]) for joint in self.joints]
 
     def _count_turns(self, state: MotorState, stored: Registers, id: int) -> MotorState:
@@ -234,10 +235,10 @@ class Chain:
         if self.lost is not None and now - self._t_identified < _IDENTIFY_PERIOD:
             raise self.lost
         self._t_identified = now
-        before = self._stored
+        before = self.stored
         self._identify(bus)
-        if self._stored != before:
-            self._stored, self._opened = before, 0
+        if self.stored != before:
+            self.stored, self._opened = before, 0
             raise DeviceNotFound(f"{self.name}: other motors, or calibrated otherwise than before", code="other_motors")
         self._t_heard.clear()
 
@@ -245,7 +246,9 @@ class Chain:
         names = "all motors" if len(silent) == len(self.ids) > 1 else ", ".join(silent)
         remedy = "check the motors' power supply and their plugs; a joint without power falls"
         if bus.surplus > bus.lost // 2:
-            remedy = f"answers come late ({bus.surplus} so far): connect the adapter directly, end busy programs"
+            late, remedy = find_latency(bus.port)
+            hint = remedy if late > 1 else "connect the adapter directly, end busy programs"
+            remedy = f"answers come late ({bus.surplus} so far): {hint}"
         fault = Fault("motor_silent", f"no answer from {names} for {1e3 * SILENCE:.0f} ms", remedy)
         return ConnectionLost.of(self.name, fault)
 

@@ -18,9 +18,10 @@ from hal.config import load
 from hal.driver import PadReading
 from hal.drivers.servo_bus import bus
 from hal.drivers.servo_bus.leader import DynamixelLeader, FeetechLeader
+from hal.errors import ConfigError
 from hal.leader import Leader
 from hal.lock import DeviceLock
-from hal_emulators.servo_bus.server import ServoBusEmulator, find_leaders
+from hal_emulators.servo_bus.server import ServoBusEmulator, find_arms, find_leaders
 
 Q = [0.3, -0.4, 0.5, 0.2, -1.0]
 
@@ -106,6 +107,13 @@ def test_a_gello_is_read_by_its_own_signs_offsets_and_trigger(tmp_path: Path) ->
             later = poll(leader)
             assert later.joints == pytest.approx([*led[:6], 0.8], abs=0.002)
             assert later.axes["r2"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_leader_is_emulated_beside_an_arm_that_has_no_port() -> None:
+    rig = {"robots": {"arm": {"model": "so101"}}, "leaders": {"lead": {"model": "so101_leader", "port": "/dev/lead"}}}
+    assert (find_arms(rig), [arm.name for arm in find_leaders(rig)]) == ([], ["lead"])
+    with pytest.raises(ConfigError, match=r"robots.arm.real.port: is missing"):
+        find_arms(rig | {"leaders": {}})
 
 
 def test_an_emulated_leader_may_not_lead_a_real_arm(leader: FeetechLeader) -> None:
