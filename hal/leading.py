@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from .config.mapping import TeleopMapping
 from .errors import CommandError
 from .geometry import Pose
 from .kinematics.arm import Kinematics
-from .leader import Leader
+from .leader import Leader, LeaderDriver
 from .teleop import Teleop
 from .types import PadState, RobotStatus
 
@@ -59,6 +59,7 @@ class LeaderTeleop(Teleop):
     ) -> None:
         super().__init__(robot, mapping, speed)
         self.leader, self.spec = leader, leader.spec
+        self._driver = cast(LeaderDriver, leader.driver)
         self.button = self.mapping.deadman
         """Button that engages it."""
         self._kinematics: Kinematics | None = None
@@ -89,6 +90,11 @@ class LeaderTeleop(Teleop):
         """Return whether the button that engages it is pressed."""
         return pad.pressed(self.button)
 
+    def watch(self) -> None:
+        """Let a leader that may move follow an arm that it leads joint to joint."""
+        if self._kinematics is None and self.spec.follow > 0.0:
+            self._driver.follow(self.robot.state(STATE_AGE).q_set.tolist())
+
     def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
         """Return the command for a state of the leader.
 
@@ -104,6 +110,7 @@ class LeaderTeleop(Teleop):
             StaleStateError: The arm's state is too old.
             ConnectionLost: The arm does not answer.
         """
+        self._driver.follow(None)
         grip = self._grip(pad)
         state = self.robot.state(STATE_AGE)
         if not (pad.joints and pad.pressed(self.button) and state.status is RobotStatus.FOLLOWING):

@@ -251,7 +251,7 @@ class ServoArm(RobotDriver):
         if (not on and self._t_on < inf) or (self._t_on == inf and [state.goal for state in states] != self._goals):
             self._prepare(states)  # also motors that went off meanwhile: their goals may be any
         elif not on:
-            self.chain.switch_on()
+            self.chain.switch(True)
         else:
             self._t_on = min(self._t_on, self._now)
             since = self._now - self._t_on

@@ -19,8 +19,9 @@ from hal.lock import DeviceLock
 from hal.serial_line import explain, open_line, read_line, set_baud
 
 from .protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer, Block, MotorState, ServoProtocol
+from .settings import ANSWER
 
-_ANSWER, _OPENING = 0.008, 0.02
+_ANSWER, _OPENING = ANSWER, 0.02
 """Longest time to wait for answers in a cycle of 100 Hz, and while a device is opened, s."""
 _PATIENCE = 2.0
 """Longest time to wait for another program to release the port, s."""

@@ -265,15 +265,15 @@ class Chain:
         self.check().write(address, values)
 
     def _spread(self, values: Sequence[int]) -> dict[int, int]:
-        """Return values of the joints for each of their motors."""
-        return {id: value for joint, value in zip(self.joints, values, strict=True) for id in joint.ids}
+        """Return values of the joints, or of the first ones, for each of their motors."""
+        return {id: value for joint, value in zip(self.joints, values, strict=False) for id in joint.ids}
 
     def _count_goals(self, goals: Sequence[int]) -> dict[int, int]:
         """Return goals as the motors count them."""
         return {id: goal + TURN * self._turns.get(id, 0) for id, goal in self._spread(goals).items()}
 
     def write_goals(self, goals: Sequence[int]) -> None:
-        """Send the goals of the joints, counts."""
+        """Send the goals of the joints, or of the first ones, counts."""
         address, size = self.protocol.goal
         values = {id: goal.to_bytes(size, "little", signed=True) for id, goal in self._count_goals(goals).items()}
         self.write(address, values)
@@ -283,17 +283,19 @@ class Chain:
         self.write(self.protocol.limit, dict.fromkeys(self.ids, limit.to_bytes(2, "little")))
 
     def prepare(self, goals: Sequence[int], limits: Sequence[int]) -> None:
-        """Give motors that are off their goals, counts, and torque limits, and take away their profile."""
+        """Give motors that are off their goals, counts, and torque limits, and take away their profile.
+
+        Those of all joints, or of the first ones.
+        """
         counts, spread = self._count_goals(goals), self._spread(limits)
-        for address, values in self.protocol.prepare(
-            self.ids, [counts[id] for id in self.ids], [spread[id] for id in self.ids], self._watch
-        ):
+        for address, values in self.protocol.prepare([*counts], [*counts.values()], [*spread.values()], self._watch):
             self.write(address, values)
         self._watched = self._watch
 
-    def switch_on(self) -> None:
-        """Switch the torque of all motors on, which also ends an overload of a Feetech motor."""
-        self.write(self.protocol.torque, dict.fromkeys(self.ids, b"\x01"))
+    def switch(self, on: bool, joints: int | None = None) -> None:
+        """Switch the torque of all joints, or of the first ones; on also ends an overload of a Feetech motor."""
+        ids = self._spread([on] * (len(self.joints) if joints is None else joints))
+        self.write(self.protocol.torque, dict.fromkeys(ids, bytes((on,))))
 
     def fault(self, states: Sequence[MotorState]) -> Fault | None:
         """Return the most telling of the motors' errors; None if there is none."""

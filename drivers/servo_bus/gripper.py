@@ -133,7 +133,7 @@ class ServoGripper(GripperDriver):
             count = self._count(here)
             if state.goal == count and state.torque_limit == self._limit:
                 self._ramp = here
-                self.chain.switch_on()
+                self.chain.switch(True)
             else:
                 self.chain.prepare([count], [self._limit])
             self._t_moved = self._now

@@ -66,10 +66,10 @@ class SteppedServos(ServoBusEmulator):
             part.stop()
 
 
-def so101_leader(emulator: SteppedServos) -> FeetechLeader:
-    """Return the driver of a leader whose motors are those of an emulated arm."""
-    rig = {"leaders": {"lead": {"model": "so101_leader", "port": emulator.arm.port}}}
-    return FeetechLeader(load(rig).resolve().pads[0])
+def so101_leader(emulator: SteppedServos, **entry: Any) -> FeetechLeader:
+    """Return the driver of a leader whose motors are those of an emulated arm; ``entry`` has more of its entry."""
+    leader = {"model": "so101_leader", "port": emulator.arm.port, **entry}
+    return FeetechLeader(load({"leaders": {"lead": leader}}).resolve().pads[0])
 
 
 class ServoBusProcess:

@@ -1,4 +1,4 @@
-"""Emulated SO-101 leaders, moved as by hands, drive two arms in real time, by the command line."""
+"""Emulated leaders, moved as by hands, drive arms in real time, by the command line: two SO-101, and a GELLO."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ from hal.apps import collect, replay
 from hal.recording import Dataset
 from hal_emulators.servo_bus.server import ServoBusEmulator, find_leaders
 
+from .calm_tour import DEADMAN, Held
+from .calm_tour import write_pad as write_held
+from .franka_kit import Emulator
+
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 RIG = """
@@ -28,6 +32,7 @@ leaders:
 gamepads:
   pad: {model: auto}
 """
+GELLO_POSES = ("0 0.3 0 -1.9 0 -1.6 0 0", "0.15 0.45 0.1 -2.1 0.1 -1.5 0.2 0")
 POSES = ("0 0 0 0 0 0", "0.15 0.2 -0.2 0.15 0.2 1", "-0.15 -0.1 0.2 -0.1 0.1 0")
 
 
@@ -67,3 +72,33 @@ def test_two_leaders_drive_two_arms_and_the_recording_is_replayed(
         played = run_here(replay.main, "data", *rig, *options)
         assert played.returncode == 0, played.stdout + played.stderr
         assert json.loads(Path("played.json").read_text())["deviation"]["tcp_mm"]["max"] < 2.0, played.stdout
+
+
+def test_a_gello_drives_an_emulated_fr3_and_the_recording_is_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
+    monkeypatch.chdir(tmp_path)
+    held: list[Held] = [(t, t + 0.1, button, 1, 0) for t, button in ((2.2, CROSS), (2.5, CROSS), (5.0, PS))]
+    held += [(*span, *control) for span in ((0.3, 2.0), (2.8, 4.8)) for control in DEADMAN]  # home, then to lead
+    pad = write_held(tmp_path / "pad.jsonl", held, 6.0)
+    leader = {"model": "gello_franka", "port": str(tmp_path / "gello.emulated"), "options": {"lever_deg": [223, 180]}}
+    with Emulator(robot="fr3") as arm:
+        changes = [f"robots.arm.real.host={arm.host}", "robots.arm.gripper.enabled=false", "cameras={}"]
+        changes += [f"leaders={json.dumps({'gello': leader})}"]
+        rig = ["--real", "--config", "franka_emulator", *(word for change in changes for word in ("--set", change))]
+        with ServoBusEmulator(find_leaders("franka_emulator", changes)) as emulator:
+            for turn in range(60):
+                emulator.execute(f"hand 1 {GELLO_POSES[turn % 2]}")
+            options = ["--pad", pad, "--episodes", 1, "--out", "data", "--report", "collected.json"]
+            done = run_here(collect.main, *rig, *options)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(Path("collected.json").read_text())["trips"] == []
+        (episode,) = Dataset("data").episodes
+        moved = np.ptp(episode.columns["rig.setpoint"][:, :7], axis=0)
+        assert np.count_nonzero(moved > 0.05) >= 4, moved
+        played = run_here(replay.main, "data", *rig, "--unattended", "--report", "played.json")
+        assert played.returncode == 0, played.stdout + played.stderr
+        assert json.loads(Path("played.json").read_text())["deviation"]["tcp_mm"]["max"] < 2.0, played.stdout
+        print(Path("played.json").read_text(), done.stdout)
+        assert not arm.events("reflex")

@@ -7,13 +7,12 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
-from lerobot.robots import RobotConfig
 from lerobot_robot_hal.follower import LeRobotArm, LeRobotGripper, check, make_robot
+from two_joints import TwoJoints
 
 from hal.config import load
 from hal.driver import Setpoint
@@ -36,48 +35,6 @@ home: [0, 0]
 limits: {velocity: 1, acceleration: 5, jerk: 100}
 gripper: {width_max: 0.08, speed: 0.1, force: 10, drivers: {real: "lerobot_robot_hal.follower:DRIVER"}}
 """
-
-
-@RobotConfig.register_subclass("two_joints")
-@dataclass(kw_only=True)
-class TwoJointsConfig(RobotConfig):
-    port: str
-    id: str | None = None
-    disable_torque_on_disconnect: bool = True
-
-
-class TwoJoints:
-    """An arm of two joints, in degrees, and a gripper from 0 to 100: they follow at once, and hold."""
-
-    newest: ClassVar[Any] = None
-    places: ClassVar[dict[str, dict[str, float]]] = {}
-    names = ("one.pos", "two.pos", "gripper.pos")
-
-    def __init__(self, config: TwoJointsConfig) -> None:
-        self.config, self.is_connected, self.unplugged = config, False, False
-        self.numbers = self.places.setdefault(config.port, dict.fromkeys(self.names, 0.0))
-        self.actions: list[dict[str, float]] = []
-        self.action_features = dict.fromkeys(self.names, float)
-        TwoJoints.newest = self
-
-    def connect(self, calibrate: bool = True) -> None:
-        assert not calibrate, "calibration would ask a person"
-        self.is_connected = True
-
-    def disconnect(self) -> None:
-        self.is_connected = False
-
-    def get_observation(self) -> dict[str, Any]:
-        time.sleep(0.002)
-        if self.unplugged:
-            raise ConnectionError("no status packet")
-        return dict(self.numbers)
-
-    def send_action(self, action: dict[str, float]) -> dict[str, float]:
-        assert set(action) == set(self.names)
-        self.numbers.update(action)
-        self.actions.append(action)
-        return action
 
 
 def specs(folder: Path, **real: Any) -> Any:

@@ -198,12 +198,16 @@ def test_it_does_not_drive_a_real_arm() -> None:
 
 
 def test_taking_over_from_a_policy_with_a_leader_never_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The set-point stands still from engaging until the leader moves, whether the policy was fast or slow."""
-    with bench("so101") as rig:
+    """The set-point stands still from engaging until the leader moves, whether the policy was fast or slow.
+
+    While the policy drives, the leader is to follow the arm; while it leads, it is let go.
+    """
+    with bench("so101", follow=0.3) as rig:
         leader, pad, arm = rig.driver("lead0"), rig.driver("pad"), rig.robots["arm0"]
         lead = rig.gamepads["lead0"]
         teleop, seen, start = make_teleop(arm, lead, "leader"), [], rig.clock.now()
-        takeover, engaged = Takeover(teleop, lead), [False]
+        takeover, engaged, given = Takeover(teleop, lead), [False], []
+        monkeypatch.setattr(leader, "follow", lambda q: given.append((rig.clock.now(), q, arm.state().q_set.tolist())))
         leader.move(POSE)
         rig.clock.sleep(0.1)
         pad.press("l2")
@@ -249,6 +253,10 @@ def test_taking_over_from_a_policy_with_a_leader_never_steps(monkeypatch: pytest
         assert still < 1e-12, "engaged, before the leader moves"
         steps = np.abs(np.diff(dq, axis=0)).max()
         assert steps <= 1.01 * max(arm.limits.acceleration) / 50, "no leap of the set-point at any time"
+        calls = [((now - start) % PERIOD, q, q_set) for now, q, q_set in given]
+        assert all(q == q_set for at, q, q_set in calls if at < 0.3 or at > 1.4)
+        assert all(q is None for at, q, _ in calls if 0.35 < at < 1.0)
+        assert len(calls) > 0.9 * len(seen)
         led = (t > 0.96) & (t < 1.0)
         assert q[led][:, 2].min() - arm.home[2] == pytest.approx(0.05, abs=0.01), (
             "the elbow, which the policy never moves"
