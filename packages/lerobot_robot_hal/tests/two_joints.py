@@ -1,4 +1,4 @@
-"""A robot of LeRobot, in a module of its own: LeRobot looks for its class there."""
+"""A robot and a camera of LeRobot, in a module of their own: LeRobot looks for their classes there."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import time
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+from lerobot.cameras import CameraConfig
 from lerobot.robots import RobotConfig
 
 
@@ -49,3 +51,39 @@ class TwoJoints:
         self.numbers.update(action)
         self.actions.append(action)
         return action
+
+
+@CameraConfig.register_subclass("plain")
+@dataclass(kw_only=True)
+class PlainConfig(CameraConfig):
+    fps: int | None = None
+    width: int | None = None
+    height: int | None = None
+    grey: int = 0
+
+
+class Plain:
+    """A camera of one colour, at its rate, as long as it is plugged in."""
+
+    unplugged: ClassVar[bool] = False
+
+    def __init__(self, config: PlainConfig) -> None:
+        self.config, self.is_connected, self.due = config, False, 0.0
+
+    def connect(self, warmup: bool = True) -> None:
+        if self.unplugged:
+            raise ConnectionError("no such camera")
+        self.is_connected = True
+
+    def disconnect(self) -> None:
+        self.is_connected = False
+
+    def async_read(self, timeout_ms: float = 200) -> Any:
+        wait = max(0.0, self.due - time.monotonic())
+        time.sleep(min(wait, 1e-3 * timeout_ms))
+        if self.unplugged:
+            raise RuntimeError("it is gone")
+        if wait > 1e-3 * timeout_ms:
+            raise TimeoutError("no frame")
+        self.due = time.monotonic() + 1.0 / self.config.fps
+        return np.full((self.config.height, self.config.width, 3), self.config.grey, np.uint8)
