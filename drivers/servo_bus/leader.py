@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from math import pi
-from typing import ClassVar, Literal
+from typing import Literal
 
 from hal.config.files import Problems, check_record, validate
 from hal.config.schema import Strict
@@ -14,10 +14,8 @@ from hal.leader import Angles, LeaderDriver
 from hal.specs import PadSpec
 
 from .chain import Chain, Joint
-from .dynamixel import Dynamixel
-from .feetech import Feetech
-from .protocol import COUNT, MotorState, ServoProtocol
-from .settings import MotorId, ServoSettings, check_baud
+from .protocol import COUNT, MotorState
+from .settings import PROTOCOLS, MotorId, ServoSettings, check_baud
 
 _WIDEST = 3.0
 """Widest range of a calibrated lever, rad."""
@@ -60,17 +58,16 @@ def check_leader(spec: PadSpec) -> Iterator[tuple[str, str, str]]:
 class ServoLeader(LeaderDriver):
     """A leader on a servo bus (options: :class:`ServoLeaderSettings`)."""
 
-    protocol: ClassVar[type[ServoProtocol]]
-
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
         own = self.settings = check_record(ServoLeaderSettings, spec.options, f"leaders.{spec.name}.options")
+        self.protocol = PROTOCOLS[spec.driver]()
         motors = dict(zip(self.leader.joints, own.ids, strict=True))
         if own.lever is not None:
             motors["the lever"] = own.lever
         joints = [Joint(label, (id,), 0.0) for label, id in motors.items()]
         bus = ServoSettings(port=own.port, baud=own.baud)
-        self.chain = Chain(spec.name, self.protocol(), bus, joints, watch=False)
+        self.chain = Chain(spec.name, self.protocol, bus, joints, watch=False)
         self._goal: Sequence[float] = ()
         """Joint positions that it comes to, rad."""
         self._mine, self._t_driven = False, 0.0
@@ -141,7 +138,8 @@ class ServoLeader(LeaderDriver):
 
     def _switch_on(self, states: Sequence[MotorState], here: Sequence[float]) -> None:
         """Give the motors their positions as goals, then, if they have these and are still there, their torque."""
-        limits = [round(self.leader.follow * self.protocol.full)] * len(states)
+        most = round(self.leader.follow * self.protocol.full)
+        limits = [min(most, registers.limit_max) for registers in self.chain.registers[: len(states)]]
         ready = [(s.torque_limit, abs(s.goal - s.position) < _MOVED) for s in states]
         if ready == [(limit, True) for limit in limits]:
             self._goal, self._mine = here, True
@@ -169,15 +167,3 @@ class ServoLeader(LeaderDriver):
     def close(self) -> None:
         super().close()
         self._disconnect()
-
-
-class FeetechLeader(ServoLeader):
-    """A leader with Feetech servos, such as that of an SO-101."""
-
-    protocol = Feetech
-
-
-class DynamixelLeader(ServoLeader):
-    """A leader with Dynamixel servos, such as a GELLO."""
-
-    protocol = Dynamixel

@@ -18,7 +18,7 @@ from waiting import wait_until
 from hal.config import load
 from hal.driver import PadReading
 from hal.drivers.servo_bus import bus
-from hal.drivers.servo_bus.leader import DynamixelLeader, FeetechLeader
+from hal.drivers.servo_bus.leader import ServoLeader
 from hal.errors import ConfigError
 from hal.leader import Leader
 from hal.lock import DeviceLock
@@ -35,17 +35,17 @@ def far() -> Iterator[SteppedServos]:
 
 
 @pytest.fixture
-def leader(far: SteppedServos) -> Iterator[FeetechLeader]:
+def leader(far: SteppedServos) -> Iterator[ServoLeader]:
     with closing(so101_leader(far)) as driver:
         driver.open()
         yield driver
 
 
-def poll(leader: FeetechLeader) -> PadReading:
+def poll(leader: ServoLeader) -> PadReading:
     return leader.poll(monotonic(), 0.0)
 
 
-def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader: FeetechLeader) -> None:
+def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader: ServoLeader) -> None:
     before = {id: bytes(servo.registers[:56]) for id, servo in {servo.id: servo for servo in far.arm.servos}.items()}
     assert poll(leader).joints == pytest.approx(Q, abs=0.001)
     far.execute("hand 0.1 0 0 0.1 0 0 1")
@@ -70,7 +70,7 @@ def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader
     ],
 )
 def test_what_is_no_leader_is_refused_by_name(
-    command: str, cause: str, far: SteppedServos, leader: FeetechLeader
+    command: str, cause: str, far: SteppedServos, leader: ServoLeader
 ) -> None:
     far.execute(command)
     far.advance(0.01)
@@ -79,7 +79,7 @@ def test_what_is_no_leader_is_refused_by_name(
     assert leader.notes == (f"lead: {leader.describe().partition(': ')[2]}",)
 
 
-def test_a_port_that_another_program_uses_is_left_to_it(far: SteppedServos, leader: FeetechLeader) -> None:
+def test_a_port_that_another_program_uses_is_left_to_it(far: SteppedServos, leader: ServoLeader) -> None:
     lock = DeviceLock(f"servo-bus-{os.path.realpath(far.arm.port)}", "the servo bus", 0.1)
     with patch.object(bus, "_PATIENCE", 0.0):
         assert not poll(leader).connected
@@ -95,7 +95,7 @@ def test_a_gello_is_read_by_its_own_signs_offsets_and_trigger(tmp_path: Path) ->
     rig = {"leaders": {"lead": entry}}
     with ServoBusEmulator(find_leaders(rig), paced=False) as far, patch.multiple(bus, _ANSWER=2.0):
         far.arms["lead"].place([0.2, -0.5, 0.1, -2.0, 0.3, 1.8, 0.7])
-        with closing(DynamixelLeader(load(rig).resolve().pads[0])) as leader:
+        with closing(ServoLeader(load(rig).resolve().pads[0])) as leader:
             leader.open()
             reading = poll(leader)
             led = [sign * q for sign, q in zip(signs, (0.2, -0.5, 0.1, -2.0, 0.3, 1.8, 0.7), strict=True)]
@@ -126,7 +126,7 @@ def test_a_leader_is_emulated_beside_an_arm_that_has_no_port() -> None:
 class Follower:
     """A leader that may follow, and an arm at :data:`Q`, from which it is away."""
 
-    def __init__(self, far: SteppedServos, leader: FeetechLeader) -> None:
+    def __init__(self, far: SteppedServos, leader: ServoLeader) -> None:
         self.far, self.leader, self.now = far, leader, 1000.0
         leader.open()
 
@@ -199,7 +199,7 @@ def test_a_leader_that_may_not_follow_never_has_torque(far: SteppedServos, follo
         so101_leader(far, follow=0.3)
 
 
-def test_an_emulated_leader_may_not_lead_a_real_arm(leader: FeetechLeader) -> None:
+def test_an_emulated_leader_may_not_lead_a_real_arm(leader: ServoLeader) -> None:
     assert "no person holds it" in str(Leader(leader).distrust())
 
 
