@@ -28,8 +28,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of ``setup-motors``."""
     made = argparse.ArgumentParser(
         prog="hal setup-motors",
-        description="Give each motor of an arm on a servo bus (Feetech, Dynamixel), and of its gripper, or of a leader "
-        "the id and the rate that the rig has for it. The motors are connected alone, one after the other.",
+        description="Give each motor of an arm or a leader on a servo bus (Feetech, Dynamixel), and of a gripper, the "
+        "id and the rate that the rig has for it. The motors are connected alone, one after the other.",
     )
     add_config_options(made)
     made.add_argument("--robot", metavar="NAME", help="the arm, or the leader (default: the first arm)")

@@ -34,7 +34,7 @@ leaders:
 gamepads:
   pad: {model: auto}
 """
-GELLO_POSES = ("0.15 0.45 0.1 -2.1 0.1 -1.5 0.2 0", "0 0.35 -0.1 -1.95 0 -1.6 0 0")
+GELLO = [0, 0.3, 0, -1.9, 0, -1.6, 0], [0.15, 0.45, 0.1, -2.1, 0.1, -1.5, 0.2]
 POSES = ("0 0 0 0 0 0", "0.15 0.2 -0.2 0.15 0.2 1", "-0.15 -0.1 0.2 -0.1 0.1 0")
 
 
@@ -88,10 +88,8 @@ def test_a_gello_drives_an_emulated_fr3_and_the_recording_is_replayed(
         person.pad.press("l2")
         wait_until(lambda: arm.state().status is RobotStatus.FOLLOWING, "following")
         arm.clock.sleep(0.2)
-        for pose in GELLO_POSES:
-            emulator.execute(f"hand 1 {pose}")
-        end = list(map(float, GELLO_POSES[-1].split()[:7]))
-        wait_until(lambda: np.allclose(emulator.execute("state")["q"], end, atol=1e-3), "moved")
+        emulator.execute(f"hand 1 {' '.join(map(str, GELLO[1]))}")
+        wait_until(lambda: np.allclose(emulator.execute("state")["q"], GELLO[1], atol=1e-3), "moved")
         wait_until(lambda: np.abs(arm.state().dq_set).max() < 1e-3, "at rest")
 
     person = Operator(drive)
@@ -105,7 +103,7 @@ def test_a_gello_drives_an_emulated_fr3_and_the_recording_is_replayed(
             redirect_stdout(person),
             monkeypatch.context() as patched,
         ):
-            emulator.arms["gello"].place([0, 0.3, 0, -1.9, 0, -1.6, 0])
+            emulator.arms["gello"].place(GELLO[0])
             patched.setattr(hal, "open", person.open_rig)
             words = ["--episodes", "1", "--out", "data", "--report", "collected.json"]
             assert collect.main([*rig, *words]) == 0, person.getvalue()
