@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lerobot_robot_hal import follower
 from lerobot_robot_hal.follower import LeRobotArm, LeRobotGripper, check, make_robot
 from two_joints import TwoJoints
 
@@ -35,6 +36,12 @@ home: [0, 0]
 limits: {velocity: 1, acceleration: 5, jerk: 100}
 gripper: {width_max: 0.08, speed: 0.1, force: 10, drivers: {real: "lerobot_robot_hal.follower:DRIVER"}}
 """
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No observation is late because this computer is busy."""
+    monkeypatch.setattr(follower, "_SILENCE", 1.0)
 
 
 def specs(folder: Path, **real: Any) -> Any:
