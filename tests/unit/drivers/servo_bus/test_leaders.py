@@ -159,6 +159,7 @@ AWAY = [0.1, -0.2, 0.3, 0.4, -0.8]
 
 
 def test_a_leader_follows_the_arm_slowly_and_with_little_torque_and_is_let_go_at_once(follower: Follower) -> None:
+    follower.far.execute(f"hand 0.1 {' '.join(map(str, Q))}")
     follower.run(100)
     assert not any(follower.on()), "as long as no policy drives"
     assert follower.run(20, AWAY, lambda: all(follower.on()[:-1]))
@@ -170,6 +171,8 @@ def test_a_leader_follows_the_arm_slowly_and_with_little_torque_and_is_let_go_at
     assert not state["on"][5], "the lever"
     assert follower.leader.poll(follower.now, 0.0).joints == pytest.approx(state["q"], abs=0.01)
     assert follower.run(2, None, lambda: not any(follower.on()))
+    follower.run(50)
+    assert follower.far.execute("state")["q"] == pytest.approx(state["q"], abs=0.02), "the hand holds it"
     assert follower.run(20, Q, lambda: all(follower.on()[:-1]))
     wait_until(lambda: follower.turn() is None and not any(follower.on()), "nobody gave it more to follow")
 
