@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from .config.mapping import TeleopMapping
 from .errors import CommandError
 from .geometry import Pose
 from .kinematics.arm import Kinematics
-from .leader import Leader
+from .leader import Leader, LeaderDriver
 from .teleop import Teleop
 from .types import PadState, RobotStatus
 
@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from .types import RobotState
 
 Array = NDArray[np.float64]
-_STILL = 1e-3
-"""Speed of every joint's set-point below which the arm counts as at rest, rad/s."""
+_STILL, _SAME = 1e-3, 1e-9
+"""Speed of every joint's set-point below which the arm counts as at rest, rad/s, if the set-point is the same, rad, as
+in the state before: one that turns back is slow for a moment."""
 _REACH = 0.999
 """Share of the arm's reach that a pose may have."""
 STATE_AGE = 2.0
@@ -58,6 +59,7 @@ class LeaderTeleop(Teleop):
     ) -> None:
         super().__init__(robot, mapping, speed)
         self.leader, self.spec = leader, leader.spec
+        self._driver = cast(LeaderDriver, leader.driver)
         self.button = self.mapping.deadman
         """Button that engages it."""
         self._kinematics: Kinematics | None = None
@@ -70,11 +72,13 @@ class LeaderTeleop(Teleop):
             message = f"{leader.name} has {len(self.spec.joints)} joints, {robot.name} {robot.n}"
             raise CommandError(message, code="cannot_lead")
         self._anchor: _Anchor | None = None
+        self._before: RobotState | None = None
+        """State of the turn before, while it is about to engage."""
 
     def reset(self) -> None:
         """Disengage: the arm stays where it is until it follows commands and is at rest, and the button is pressed."""
         super().reset()
-        self._anchor = None
+        self._anchor = self._before = None
 
     def prepare_takeover(self) -> None:
         """Engage by the mapping's ``take_over`` instead of the dead-man. Raises CommandError if there is none."""
@@ -85,6 +89,11 @@ class LeaderTeleop(Teleop):
     def is_touched(self, pad: PadState) -> bool:
         """Return whether the button that engages it is pressed."""
         return pad.pressed(self.button)
+
+    def watch(self) -> None:
+        """Let a leader that may move follow an arm that it leads joint to joint."""
+        if self._kinematics is None and self.spec.follow > 0.0:
+            self._driver.follow(self.robot.state(STATE_AGE).q_set.tolist())
 
     def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
         """Return the command for a state of the leader.
@@ -101,15 +110,23 @@ class LeaderTeleop(Teleop):
             StaleStateError: The arm's state is too old.
             ConnectionLost: The arm does not answer.
         """
+        self._driver.follow(None)
         grip = self._grip(pad)
         state = self.robot.state(STATE_AGE)
         if not (pad.joints and pad.pressed(self.button) and state.status is RobotStatus.FOLLOWING):
-            self._anchor = None
-        elif self._anchor is None and np.abs(state.dq_set).max() < _STILL:
+            self._anchor = self._before = None
+        elif self._anchor is None and self._rests(state):
             self._anchor = self._make_anchor(pad.joints, state)
         if self._anchor is None:
             return JointVelocity(np.zeros(self.robot.n)), grip
         return self._anchor.follow(np.array(pad.joints), dt), grip
+
+    def _rests(self, state: RobotState) -> bool:
+        """Return whether the set-point is at rest, by this state and the newest one before it."""
+        before, self._before = self._before, state
+        if before is None or state.stamp.t <= before.stamp.t:
+            return False
+        return bool(np.abs(state.dq_set).max() < _STILL and np.abs(state.q_set - before.q_set).max() < _SAME)
 
     def _make_anchor(self, joints: tuple[float, ...], state: RobotState) -> _Anchor:
         if self._kinematics is not None:

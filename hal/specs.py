@@ -369,6 +369,8 @@ class LeaderSpec:
     """What its lever is: ``gripper``, ``deadman`` or ``none``."""
     deadman: str | None
     """Gamepad of the rig that must be held; None for the lever, or for no dead-man at all."""
+    follow: float = 0.0
+    """Share of its motors' torque with which it follows the arm while a policy drives it; 0: it never does."""
     emulated: bool = False
 
     @property

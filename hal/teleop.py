@@ -107,6 +107,9 @@ class Teleop:
             return pad.axis(gripper.axis) > _PRESSED
         return any(pad.pressed(button) for button in (gripper.open, gripper.close, gripper.toggle) if button)
 
+    def watch(self) -> None:
+        """Note that a policy drives the arm in this turn."""
+
     def step(self, pad: PadState, dt: float) -> tuple[Twist, float | None]:
         """Return the command for a pad's state.
 

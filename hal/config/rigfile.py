@@ -407,6 +407,8 @@ class LeaderConfig(LeaderJoints):
     own position, at the arm's ``move_speed``."""
     pose_scale: Annotated[float, Quantity("", 0.0, 10.0, above=True)] = 1.0
     """Way of the arm's tcp for each m of the leader's, if it leads by poses."""
+    follow: Annotated[float, Quantity("", 0.0, 0.5)] = 0.0
+    """Share of its motors' torque with which the leader follows the arm while a policy drives it; 0: it never does."""
 
 
 def _check_engine(name: str) -> str:

@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import io
 import json
+import threading
+import time
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
+
+import hal
 
 
 class Done(NamedTuple):
@@ -48,6 +52,55 @@ def run_here(main: Callable[[list[str]], int], *arguments: object, answer: str =
     return Done(status, printed.getvalue(), errors.getvalue())
 
 
+class Operator(io.StringIO):
+    """The output of ``hal collect``, and a person who reads it with a mock pad in the hands.
+
+    The arm is driven home, and one episode is recorded and saved.
+
+    Args:
+        drive: Drives the arm, with the dead-man of :attr:`pad`, while the episode is recorded.
+    """
+
+    def __init__(self, drive: Callable[[Operator], None]) -> None:
+        super().__init__()
+        self._drive, self._open, self._at_home = drive, hal.open, threading.Event()
+
+    def open_rig(self, **options: Any) -> hal.Rig:
+        """Open a rig as ``hal.open`` does, and take its pad."""
+        self.rig = self._open(**options)
+        self.pad: Any = self.rig.driver("pad")
+        return self.rig
+
+    def write(self, text: str) -> int:
+        act = {"then hold it until": self._hold, "place the objects": self._start, "RECORDING": self._record}
+        for words, what in act.items():
+            if words in text:
+                threading.Thread(target=what).start()
+        return super().write(text)
+
+    def _hold(self) -> None:
+        while not self._at_home.wait(2.0):  # a press that was too early does not count
+            self.pad.release("l2")
+            time.sleep(0.2)
+            self.pad.press("l2")
+
+    def _start(self) -> None:
+        self._at_home.set()
+        self.pad.release("l2")
+        self._tap("south")
+
+    def _record(self) -> None:
+        self._drive(self)
+        self.pad.release("l2")
+        self._tap("home")
+
+    def _tap(self, button: str) -> None:
+        time.sleep(0.2)
+        self.pad.press(button)
+        time.sleep(0.2)
+        self.pad.release(button)
+
+
 CROSS, CIRCLE, SQUARE, PS = "BTN_SOUTH", "BTN_EAST", "BTN_WEST", "BTN_MODE"
 
 _TAP = 0.1  # s
@@ -60,12 +113,20 @@ def seed_of(number: int, draws: int = 0, seed: int = 0) -> int:
     return int(np.random.SeedSequence([seed, number, draws]).generate_state(1)[0])
 
 
-def write_pad(folder: Path, *presses: tuple[float, str], until: float, held: tuple[float, float] | None = None) -> str:
-    """Write a recorded DualShock 4 on which buttons are tapped, at s; L2 is ``held`` from s to s. Return its path."""
+def write_pad(
+    folder: Path,
+    *presses: tuple[float, str] | tuple[float, str, float],
+    until: float,
+    held: tuple[float, float] | None = None,
+) -> str:
+    """Write a recorded DualShock 4 on which buttons are tapped, at s, or pressed for s; L2 is ``held`` from s to s.
+
+    Return its path.
+    """
     ranges = {axis: [0, 255, 15] for axis in ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY", "ABS_Z", "ABS_RZ")}
     header = {"format": "hal-pad-events", "version": 1, "model": "dualshock4", "ranges": ranges}
     events = [(0.0, axis, 0 if axis in ("ABS_Z", "ABS_RZ") else 128) for axis in ranges]
-    events += [(t + up * _TAP, button, 1 - up) for t, button in presses for up in (0, 1)]
+    events += [(t + up * (*how, _TAP)[0], button, 1 - up) for t, button, *how in presses for up in (0, 1)]
     if held is not None:
         events += [(t, code, value * down) for t, down in zip(held, (1, 0), strict=True) for code, value in _SQUEEZE]
     events.append((until, "ABS_X", 128))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
-import threading
 import time
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +13,7 @@ import yaml
 
 pytest.importorskip("av", reason="needs PyAV: pip install 'robot-hal[record]'")
 
+from app_kit import Operator
 from webcam_kit import grey, webcams
 
 import hal
@@ -29,61 +27,21 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone]
 RATE = 30
 
 
-class Operator(io.StringIO):
-    """The program's output, and a person who reads it with a pad in the hands."""
-
-    pad: Any = None
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.at_home = threading.Event()
-
-    def write(self, text: str) -> int:
-        act = {"then hold it until": self.hold, "place the objects": self.start, "RECORDING": self.drive}
-        for words, what in act.items():
-            if words in text:
-                threading.Thread(target=what).start()
-        return super().write(text)
-
-    def hold(self) -> None:
-        while not self.at_home.wait(2.0):  # a press that was too early does not count
-            self.pad.release("l2")
-            time.sleep(0.2)
-            self.pad.press("l2")
-
-    def start(self) -> None:
-        self.at_home.set()
-        self.pad.release("l2")
-        self.tap("south")
-
-    def tap(self, button: str) -> None:
-        time.sleep(0.2)
-        self.pad.press(button)
-        time.sleep(0.2)
-        self.pad.release(button)
-
-    def drive(self) -> None:
-        self.pad.press("l2")
-        self.pad.stick("dpad_y", 1.0)
-        time.sleep(1.0)
-        self.pad.press("l1")
-        time.sleep(1.0)
-        self.pad.set(axes={"dpad_y": 0.0}, buttons=("l2",))
-        time.sleep(0.5)
-        self.pad.release("l2")
-        self.tap("home")
+def drive(person: Operator) -> None:
+    """Drive forwards, then up as well, and release the dead-man when the arm is at rest."""
+    person.pad.press("l2")
+    person.pad.stick("dpad_y", 1.0)
+    time.sleep(1.0)
+    person.pad.press("l1")
+    time.sleep(1.0)
+    person.pad.set(axes={"dpad_y": 0.0}, buttons=("l2",))
+    time.sleep(0.5)
 
 
 def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    emulator, person, opened = UrEmulator(), Operator(), hal.open
-
-    def open_rig(**options: Any) -> hal.Rig:
-        rig = opened(**options)
-        person.pad = rig.driver("pad")
-        return rig
-
+    emulator, person = UrEmulator(), Operator(drive)
     camera = {"model": "webcam", "capture": {"width": 64, "height": 48, "rate_hz": RATE}}
     ports = {"left": "1-1", "right": "1-2"}
     rig = emulator.rig() | {"gamepads": {"pad": {"driver": "mock"}}}
@@ -97,7 +55,7 @@ def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
             redirect_stdout(person),
             monkeypatch.context() as patched,
         ):
-            patched.setattr(hal, "open", open_rig)
+            patched.setattr(hal, "open", person.open_rig)
             words = ["--speed", "0.1", "--out", data, "--episodes", "1", "--task", "reach"]
             assert collect.main([*options, *words]) == 0, person.getvalue()
         (episode,) = Dataset(data).episodes

@@ -12,10 +12,9 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from hal.config.loader import load
 from hal.specs import RobotSpec
 from hal_emulators.control import note_signals
-from hal_emulators.shared_world import find_address, has_world
+from hal_emulators.shared_world import find_address, has_world, load_real
 from hal_emulators.ur.motion import ROBOTS
 
 _END = 10.0
@@ -45,7 +44,7 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
         ConfigError: The rig is not valid.
         ValueError: A device is not at an address of this computer, a UR's model has no emulator, or nothing is real.
     """
-    rig = load(config, sim=False, overrides=overrides).resolve()
+    rig = load_real(config, overrides)
     words = ["--config", config, *(word for value in overrides for word in ("--set", value))]
     foreign = [arm.name for arm in rig.robots if arm.attended and not arm.emulated]
     if foreign:
