@@ -23,12 +23,12 @@ from typing import Any
 
 from .kit import ROOT
 
-SERVER, CLIENT = "127.1.0.1", "127.1.0.2"
+SERVER, CLIENT = "127.0.0.1", "127.0.0.2"
 _TUN, _NO_HEADER, _SET_DEVICE = 1, 0x1000, 0x400454CA  # linux/if_tun.h
 _NEW_NETWORK = 0x40000000  # CLONE_NEWNET
 _SET_UP = """
 ip link set lo up
-ip route del local 127.0.0.0/8 dev lo table local
+ip address del 127.0.0.1/8 dev lo
 for name in all net0; do echo 1 > /proc/sys/net/ipv4/conf/$name/route_localnet; done
 ip address add {own} peer {other} dev net0
 ip link set net0 up

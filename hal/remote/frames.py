@@ -13,13 +13,12 @@ import threading
 import zlib
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arguments import freeze
-from ..camera import Camera
 from ..driver import CameraInfo, RawFrame, StreamInfo
 from ..errors import ConnectionLost
 from ..geometry import Pose
@@ -27,6 +26,9 @@ from ..specs import CameraSpec
 from ..types import STREAMS, Frame
 from .boxes import Box
 from .link import RigLink
+
+if TYPE_CHECKING:
+    from ..camera import Camera
 
 LARGEST = 64 << 20
 """Size of the largest frame, bytes: 4K with colour and depth."""
@@ -185,7 +187,8 @@ def _unit(spec: CameraSpec) -> float:
 
 
 def _to_metres(units: NDArray[np.uint16], spec: CameraSpec) -> NDArray[np.float32]:
-    return units.astype(np.float32) * np.float32(_unit(spec))
+    metres: NDArray[np.float32] = units.astype(np.float32) * np.float32(_unit(spec))
+    return metres
 
 
 # What a camera is, as JSON.
@@ -215,8 +218,8 @@ def _pack_stream(stream: StreamInfo) -> list[Any]:
 def unpack_info(data: dict[str, Any]) -> CameraInfo:
     """Return the figures that :func:`pack_info` packed."""
     streams = {
-        name: StreamInfo(*plain, freeze(K), freeze(distortion), Pose(*pose))
-        for name, (*plain, K, distortion, pose) in data["streams"].items()
+        name: StreamInfo(kind, width, height, rate_hz, freeze(K), freeze(distortion), Pose(*pose))
+        for name, (kind, width, height, rate_hz, K, distortion, pose) in data["streams"].items()
     }
     arrays = {name: freeze(data[name]) for name in ("K", "distortion", "K_infrared") if data[name] is not None}
     whole = {"streams": MappingProxyType(streams), "options": MappingProxyType(data["options"])}

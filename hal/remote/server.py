@@ -21,7 +21,7 @@ from ..host.hosts import RemoteHost
 from ..host.process import STOP_LIMIT, pack_error
 from ..host.records import GripperMail, RobotMail
 from ..servo.watchdog import SILENCE
-from ..specs import Plan, to_json
+from ..specs import CameraSpec, Plan, RobotSpec, to_json
 from .boxes import boxes_of_hosts, boxes_of_program
 from .frames import send_frames
 from .link import CLOSE_LIMIT, MOST_ROUND_TRIP, RigLink, describe_version
@@ -310,12 +310,13 @@ def check_servable(plan: Plan) -> None:
     """Raise NotSupported or CommandError for a rig that cannot be served, as :class:`Server`."""
     if plan.clock == "lock_step":
         raise NotSupported("a served rig needs real time; leave out the clock lock_step", code="needs_real_time")
-    for device in (*plan.robots, *plan.cameras):
+    devices: tuple[RobotSpec | CameraSpec, ...] = (*plan.robots, *plan.cameras)
+    for device in devices:
         if device.at is not None:
             raise NotSupported(
                 f"{device.name} is served by another computer: name that one in the rig", code="served_twice"
             )
-    if not (plan.robots or plan.cameras):
+    if not devices:
         raise CommandError(f"{plan.source} has no arm or camera to serve", code="no_devices")
 
 
