@@ -102,17 +102,18 @@ def test_an_episode_with_pictures_is_collected_over_the_link_and_replayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """``hal serve``, ``hal collect`` and ``hal replay``, with a camera and an arm of the other computer."""
-    server, at = start_server(*small(160, 120), "cameras.wrist.streams=[color]")
+    server, at = start_server(*small(160, 120))
     person = Operator()
     try:
-        devices = {"robots": {"panda": {"at": at}}, "cameras": {"scene": {"at": at}, "wrist": {"at": at}}}
+        devices = {"robots": {"panda": {"at": at}}, "cameras": {"scene": {"at": at}}}
         (tmp_path / "rig.yaml").write_text(json.dumps({**devices, "gamepads": {"pad": {"driver": "mock"}}}))
         rig, data, report = ["--config", str(tmp_path / "rig.yaml")], str(tmp_path / "data"), tmp_path / "report.json"
         with person.operate(monkeypatch):
-            assert collect.main([*rig, "--out", data, "--episodes", "1"]) == 0, person.getvalue()
+            words = ["--out", data, "--episodes", "1", "--speed", "0.3"]  # 30 rows a second are enough for 2 mm
+            assert collect.main([*rig, *words]) == 0, person.getvalue()
         (episode,) = Dataset(data).episodes
         frames = list(episode.frames("scene"))
-        assert len(frames) == len(list(episode.depth("scene"))) == len(list(episode.frames("wrist"))) == episode.length
+        assert len(frames) == len(list(episode.depth("scene"))) == episode.length
         assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50, "the arm moved in the pictures"
         assert (episode.stamps["grid"] >= episode.stamps["camera.scene"]).all(), "times are those of this computer"
         tcp = episode.columns["observation.tcp"][:, :3]
