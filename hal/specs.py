@@ -335,6 +335,8 @@ class CameraSpec:
     """Camera matrix of both infrared images of a frame; None if they have the view of ``K``."""
     depth_sensor: DepthSensorSpec | None = None
     """None if the model has none."""
+    at: str | None = None
+    """Address of the computer that serves this camera; None if it is at this one."""
 
     @property
     def reference(self) -> str:

@@ -7,18 +7,14 @@ from __future__ import annotations
 
 import io
 import json
-import threading
-import time
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
-
-import hal
 
 
 class Done(NamedTuple):
@@ -50,55 +46,6 @@ def run_here(main: Callable[[list[str]], int], *arguments: object, answer: str =
         except SystemExit as ended:  # argparse
             status = int(ended.code or 0)
     return Done(status, printed.getvalue(), errors.getvalue())
-
-
-class Operator(io.StringIO):
-    """The output of ``hal collect``, and a person who reads it with a mock pad in the hands.
-
-    The arm is driven home, and one episode is recorded and saved.
-
-    Args:
-        drive: Drives the arm, with the dead-man of :attr:`pad`, while the episode is recorded.
-    """
-
-    def __init__(self, drive: Callable[[Operator], None]) -> None:
-        super().__init__()
-        self._drive, self._open, self._at_home = drive, hal.open, threading.Event()
-
-    def open_rig(self, **options: Any) -> hal.Rig:
-        """Open a rig as ``hal.open`` does, and take its pad."""
-        self.rig = self._open(**options)
-        self.pad: Any = self.rig.driver("pad")
-        return self.rig
-
-    def write(self, text: str) -> int:
-        act = {"then hold it until": self._hold, "place the objects": self._start, "RECORDING": self._record}
-        for words, what in act.items():
-            if words in text:
-                threading.Thread(target=what).start()
-        return super().write(text)
-
-    def _hold(self) -> None:
-        while not self._at_home.wait(2.0):  # a press that was too early does not count
-            self.pad.release("l2")
-            time.sleep(0.2)
-            self.pad.press("l2")
-
-    def _start(self) -> None:
-        self._at_home.set()
-        self.pad.release("l2")
-        self._tap("south")
-
-    def _record(self) -> None:
-        self._drive(self)
-        self.pad.release("l2")
-        self._tap("home")
-
-    def _tap(self, button: str) -> None:
-        time.sleep(0.2)
-        self.pad.press(button)
-        time.sleep(0.2)
-        self.pad.release(button)
 
 
 CROSS, CIRCLE, SQUARE, PS = "BTN_SOUTH", "BTN_EAST", "BTN_WEST", "BTN_MODE"

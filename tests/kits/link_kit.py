@@ -16,7 +16,7 @@ from typing import Any
 
 from waiting import wait_until
 
-from hal.config import load
+import hal
 from hal.host.records import RobotMail, ServoRecord
 from hal.remote.server import Server
 
@@ -195,8 +195,8 @@ def _has_message(frame: bytes) -> bool:
 class Bench:
     """A served mock arm, and a proxy before it."""
 
-    def __init__(self, server: Server) -> None:
-        self.server = server
+    def __init__(self, rig: hal.Rig, server: Server) -> None:
+        self.rig, self.server = rig, server
         self.proxy = Proxy(server.port)
         self.programs: list[DrivingProgram] = []
 
@@ -209,8 +209,7 @@ class Bench:
     @property
     def mail(self) -> RobotMail:
         """The mailboxes of the arm, at its own host."""
-        assert self.server.served is not None
-        return self.server.served.hosts[0].memory.robots["panda"]
+        return self.rig.robots["panda"]._mail
 
     def servo(self) -> ServoRecord:
         """Return the newest state of the servo."""
@@ -220,24 +219,24 @@ class Bench:
 
     def speed(self) -> float:
         """Return the speed of the first joint's set-point, rad/s."""
-        return abs(self.servo().dq_set[0]) if self.server.served is not None and self.mail.state.seq() else 0.0
+        return abs(self.servo().dq_set[0])
 
 
 @contextmanager
 def served_arm() -> Iterator[Bench]:
     """Serve a mock arm; close everything in the end."""
     overrides = {"cameras": {}, "gamepads": {}, "objects": []}
-    plan = load("panda_table", driver="mock", clock="real_time", overrides=overrides).resolve()
-    server = Server(plan, "127.0.0.1", 0, lambda line: None)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    bench = Bench(server)
-    try:
-        yield bench
-    finally:
-        for program in bench.programs:
-            program.process.kill()
-            program.process.wait()
-        server.close()
-        thread.join()
-        bench.proxy.close()
+    with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=overrides) as rig:
+        server = Server(rig, "127.0.0.1", 0, lambda line: None)
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        bench = Bench(rig, server)
+        try:
+            yield bench
+        finally:
+            for program in bench.programs:
+                program.process.kill()
+                program.process.wait()
+            server.close()
+            thread.join()
+            bench.proxy.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,10 @@ import pytest
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
-from app_kit import CROSS, PS, Operator, run_here, write_pad
+from app_kit import CROSS, PS, run_here, write_pad
+from operator_kit import Operator
 from waiting import wait_until
 
-import hal
 from hal.apps import collect, replay
 from hal.recording import Dataset
 from hal.types import RobotStatus
@@ -100,11 +99,9 @@ def test_a_gello_drives_an_emulated_fr3_and_the_recording_is_replayed(
         rig = ["--real", "--config", "franka_emulator", *(word for change in changes for word in ("--set", change))]
         with (
             ServoBusEmulator(find_leaders("franka_emulator", changes)) as emulator,
-            redirect_stdout(person),
-            monkeypatch.context() as patched,
+            person.operate(monkeypatch),
         ):
             emulator.arms["gello"].place(GELLO[0])
-            patched.setattr(hal, "open", person.open_rig)
             words = ["--episodes", "1", "--out", "data", "--report", "collected.json"]
             assert collect.main([*rig, *words]) == 0, person.getvalue()
         assert json.loads(Path("collected.json").read_text())["trips"] == []

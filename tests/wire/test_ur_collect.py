@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
-from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +11,9 @@ import yaml
 
 pytest.importorskip("av", reason="needs PyAV: pip install 'robot-hal[record]'")
 
-from app_kit import Operator
+from operator_kit import Operator
 from webcam_kit import grey, webcams
 
-import hal
 from hal.apps import collect, replay
 from hal.recording import Dataset
 
@@ -27,21 +24,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone]
 RATE = 30
 
 
-def drive(person: Operator) -> None:
-    """Drive forwards, then up as well, and release the dead-man when the arm is at rest."""
-    person.pad.press("l2")
-    person.pad.stick("dpad_y", 1.0)
-    time.sleep(1.0)
-    person.pad.press("l1")
-    time.sleep(1.0)
-    person.pad.set(axes={"dpad_y": 0.0}, buttons=("l2",))
-    time.sleep(0.5)
-
-
 def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    emulator, person = UrEmulator(), Operator(drive)
+    emulator, person = UrEmulator(), Operator()
     camera = {"model": "webcam", "capture": {"width": 64, "height": 48, "rate_hz": RATE}}
     ports = {"left": "1-1", "right": "1-2"}
     rig = emulator.rig() | {"gamepads": {"pad": {"driver": "mock"}}}
@@ -52,10 +38,8 @@ def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
     try:
         with (
             webcams(tmp_path, *({"port": port} for port in ports.values())),
-            redirect_stdout(person),
-            monkeypatch.context() as patched,
+            person.operate(monkeypatch),
         ):
-            patched.setattr(hal, "open", person.open_rig)
             words = ["--speed", "0.1", "--out", data, "--episodes", "1", "--task", "reach"]
             assert collect.main([*options, *words]) == 0, person.getvalue()
         (episode,) = Dataset(data).episodes
