@@ -71,7 +71,7 @@ const HANDLERS = {
     recording.forget();
     panel.open(rig.robots);
     settings.open(rig);
-    cameras.open(rig.cameras, rig.stage);
+    cameras.open(rig.cameras, rig.stage && `${rig.stage}/${hello.page}/`);
     gamepad.describe();
   },
   lease(message) {
