@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from urllib.parse import urlsplit
@@ -79,9 +80,7 @@ def test_the_gizmo_moves_the_arm_while_the_page_in_control_is_held_and_for_that_
     mine = urlsplit(staged.run(f"return {FRAME}.src")).path
     with connect(f"ws://{link.netloc}/live", **live) as other:
         number = json.loads(other.recv(timeout=5.0))["page"]
-        views = [
-            PlainPage(path, bench.link) for path in (mine, f"{mine.rpartition('/')[0].rpartition('/')[0]}/{number}")
-        ]
+        views = [PlainPage(path, bench.link) for path in (mine, re.sub(r"/\d+/$", f"/{number}", mine))]
         own, foreign = views
 
         def drive() -> None:

@@ -268,7 +268,8 @@ def test_a_fault_is_shown_and_its_remedy_is_what_recovers(bench: Bench, moving: 
     bench.arm.inject(fault="joint 3 is too warm")
     wait_for(lambda: "joint 3 is too warm" in moving.text("#fault"), "the page to tell the fault")
     button = re.search('Press "(.+)", then release everything and hold again', moving.text("#fault-remedy"))
-    assert button and "()" not in moving.text("#fault"), "the remedy is in the words of the page"
+    assert button is not None, "the remedy is in the words of the page"
+    assert "()" not in moving.text("#fault")
     (named,) = moving.run(BUTTONS, button[1])
     moving.key("ArrowLeft", "ArrowLeft", False)
     moving.let_go()
