@@ -63,7 +63,6 @@ class WebConsole(Console):
         """
         super().__init__(rig, listen, driven_by=driven_by)
         self._queues: list[PadQueue] = []
-        self._driver: str | None = None
         self._token = secrets.token_urlsafe(_TOKEN_BYTES)
         self._address, self._port = listen.address, listen.port
         self._watched: frozenset[str] = frozenset()
@@ -120,11 +119,6 @@ class WebConsole(Console):
         return ssh_tunnel(self._address, self._port) if is_loopback(self._address) else ""
 
     # The pad's side, see WebPad.
-
-    @property
-    def driver(self) -> str | None:
-        """Name of the page in control; None if there is none."""
-        return self._driver
 
     @property
     def stop_count(self) -> int:
@@ -184,7 +178,7 @@ class WebConsole(Console):
         self._setting_handler = changed
 
     def _process_lost(self) -> None:
-        self._driver = None
+        self.driver = None
         self._put_reading(lost_reading(time.monotonic(), 0))
         print("the console has ended: no page can drive or stop any more; start the program again", file=sys.stderr)
 
@@ -202,7 +196,7 @@ class WebConsole(Console):
             page = message["stop"]
             self._channel.send("say", t=time.monotonic(), text=f"STOP was pressed on {page}", stop=page)
         elif "driver" in message:
-            self._driver = message["driver"]
+            self.driver = message["driver"]
         elif "watched" in message:
             self._watched = frozenset(message["watched"])
         elif "recover" in message:

@@ -117,6 +117,32 @@ def test_an_arm_of_another_kind_is_led_by_the_pose_of_the_leaders_tcp() -> None:
         assert arm.state().tcp_set.distance(tcp)[1] == pytest.approx(from_.distance(to)[1], abs=0.01)
 
 
+def test_a_hand_leads_an_arm_from_where_both_are_when_it_is_squeezed() -> None:
+    with hal.open({"robots": {"arm": {"model": "panda"}}, "gamepads": {"pad": {"sim": True}}}, driver="mock") as rig:
+        pad, arm, hand = rig.driver("pad"), rig.robots["arm"], np.array([1.0, 2.0, 0.5, 0.0, 0.0, 0.6, 0.8])
+        poll = pad.poll
+
+        def poll_hand(now: float, timeout: float) -> Any:
+            found = poll(now, timeout)
+            return found._replace(pose=tuple(hand) if "l2" in found.buttons else ())
+
+        pad.poll = poll_hand
+        tcp, way = arm.state().tcp_set, np.array([0.05, -0.04, 0.06])
+
+        def lead(t: float) -> None:
+            (pad.press if t > 0.1 else pad.release)("l2")
+            hand[:3] = [1.0, 2.0, 0.5] + way * ramp(t - 0.4)
+            hand[5:] = math.sin(0.6435 + 0.1 * ramp(t - 0.4)), math.cos(0.6435 + 0.1 * ramp(t - 0.4))
+
+        drive(rig, 2.0, lead)
+        assert arm.state().tcp_set.position - tcp.position == pytest.approx(way, abs=2e-3)
+        assert arm.state().tcp_set.distance(tcp)[1] == pytest.approx(0.2, abs=0.01)
+        hand[:3], tcp = 0.0, arm.state().tcp_set
+        drive(rig, 1.0, lambda t: (pad.press if t > 0.1 else pad.release)("l2"))
+        assert rig.gamepads["pad"].hold("l2").held
+        assert arm.state().tcp_set.distance(tcp)[0] < 1e-9, "squeezed again elsewhere, and no step"
+
+
 def test_one_pad_is_the_dead_man_of_two_leaders_that_drive_two_arms() -> None:
     with bench("so101", "so101") as rig:
         leaders, pad = [rig.driver("lead0"), rig.driver("lead1")], rig.driver("pad")
