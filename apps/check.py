@@ -3,6 +3,7 @@ the physics of the simulation beside theory.
 
 hal check --real --config my_rig.yaml
 hal check --pads
+hal check --at arm-pc
 hal check --physics --engine mujoco
 """
 
@@ -378,6 +379,11 @@ def parser() -> argparse.ArgumentParser:
         "if there is none",
     )
     made.add_argument(
+        "--at",
+        metavar="ADDRESS[:PORT]",
+        help="instead, measure the link to a rig that `hal serve` has: round trips, clocks, and what they allow",
+    )
+    made.add_argument(
         "--physics",
         action="store_true",
         help="instead, run experiments whose results are known from theory in the simulation (--engine), and print the "
@@ -403,6 +409,8 @@ def main(args: argparse.Namespace) -> int:
     duration = _DURATION if args.duration is None else args.duration
     if not 0.0 < duration <= 60.0:
         raise CommandError(f"--duration must be above 0 and at most 60, not {duration:g}")
+    if args.at is not None:
+        return _link(args.at, duration, args.json)
     plan = load(**config_options(args)).resolve()
     verdicts = preflight(plan, duration)
     if args.json:
@@ -412,6 +420,25 @@ def main(args: argparse.Namespace) -> int:
         found = _print_results(verdicts)
         if not list_real_arms(plan) and not list_checked_cameras(plan) and not list_leaders(plan):
             print("no device checks for this rig; checked this computer only")
+    return 0 if _fit(found) else ACTION_NEEDED
+
+
+def _link(at: str, duration: float, as_json: bool) -> int:
+    from hal.remote.client import split_address
+    from hal.remote.measure import judge_link, measure_link, plot
+
+    try:
+        split_address(at)
+    except ValueError:
+        raise CommandError(f"--at takes ADDRESS[:PORT], not {at!r}", code="bad_address") from None
+    link = measure_link(at, duration)
+    if as_json:
+        found = list(judge_link(link))
+        print(json.dumps({"link": link._asdict(), "verdicts": [asdict(verdict) for verdict in found]}, indent=2))
+    else:
+        found = _print_results(judge_link(link))
+        for line in plot(link.round_trips):
+            print(f"{_INDENT}{line}")
     return 0 if _fit(found) else ACTION_NEEDED
 
 

@@ -33,6 +33,7 @@ PROGRAMS = {
     "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
     "serve": "serve the arms of this computer to a program on another one",
+    "keys": "make, list and revoke certificates for connections between computers",
     "serve-lerobot": "serve a policy that was trained with LeRobot, for rollout",
     "generate": "generate a dataset in simulation, on several workers",
     "grasp": "find an object and grasp it",

@@ -26,7 +26,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--listen",
         metavar="ADDRESS[:PORT]",
-        help="address to listen at; only this computer's own (default: 127.0.0.1:7447; port 0 for a free one)",
+        help="address to listen at (default: 127.0.0.1:7447; port 0 for a free one). Every other than 127.0.0.1 needs "
+        "certificates: hal keys",
     )
     return made
 
@@ -48,7 +49,13 @@ def main(args: argparse.Namespace) -> int:
     with hal.open(**config_options(args), pad="none") as rig:
         server = Server(rig, listen.address, listen.port if listen.fixed else PORT, _report)
         _report(banner(rig))
-        _report(f"listening at {server.address}:{server.port}, reachable from this computer only; Ctrl-C ends")
+        keys = server.entrance.credentials
+        who = (
+            "reachable from this computer only"
+            if keys is None
+            else f"for those with a certificate, as {keys.file.stem}"
+        )
+        _report(f"listening at {server.address}:{server.port}, {who}; Ctrl-C ends")
         server.run()
     return 0
 

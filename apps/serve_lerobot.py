@@ -37,8 +37,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="hal serve-lerobot",
         description="Serve a policy that was trained with LeRobot on a recording of this package, for hal rollout.",
-        epilog="It runs in LeRobot's environment. There is no password: listen on other addresses only in a network "
-        "that you trust.",
+        epilog="It runs in LeRobot's environment.",
     )
     made.add_argument("checkpoint", metavar="CHECKPOINT", help="folder with config.json and model.safetensors")
     made.add_argument(
@@ -50,7 +49,12 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="real-time chunking: each chunk continues the one before (pi0, pi05, SmolVLA)",
     )
-    made.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen at (%(default)s)")
+    made.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="address to listen at (%(default)s); every other needs certificates: hal keys",
+    )
     made.add_argument("--port", type=int, default=8000, help="port; 0 for a free one (%(default)s)")
     made.add_argument("--until-stdin-ends", action="store_true", help="end when standard input is closed")
     return made
@@ -59,8 +63,10 @@ def parser() -> argparse.ArgumentParser:
 @program(parser)
 def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
+    from hal.keys import Credentials, needs_keys
     from hal.learning.remote import PolicyServer
 
+    keys = Credentials("host") if needs_keys(args.host) else None
     if args.until_stdin_ends:
         threading.Thread(target=_end_with_stdin, daemon=True).start()
     checkpoint = Path(args.checkpoint).expanduser()
@@ -71,7 +77,8 @@ def main(args: argparse.Namespace) -> int:
     metadata = describe(info, policy.inputs)
     if policy.rtc_delay:
         metadata["rtc_max_delay_steps"] = policy.rtc_delay
-    with PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, host=args.host, port=args.port) as server:
+    where: dict[str, Any] = {"host": args.host, "port": args.port, "credentials": keys}
+    with PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, **where) as server:
         print(f"{policy.kind} for {', '.join(metadata['joints'])} at {metadata['policy_config']['rate_hz']} Hz")
         print(f"{LISTENING}{server.url}", flush=True)
         server.wait()

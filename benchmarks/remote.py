@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import random
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -13,22 +15,25 @@ from contextlib import contextmanager
 from typing import Any
 
 import hal
+from hal.keys import make_key
 
 from ._network import SERVER, run_apart
 from .kit import ROOT, Table, compare, cpu, ms
 
-PATHS = ("hal/remote/",)
+PATHS = ("hal/remote/", "hal/keys.py")
 RATE = 1000.0
 """Of the servo, Hz."""
 CHANGES = [f"simulation.physics_hz={RATE:g}", "cameras={}", "objects=[]"]
 TURN = hal.JointVelocity([0.0] * 7)
+WITH_TLS = "127.0.0.2"
+"""An address at which certificates are needed."""
 
 
 @contextmanager
-def serve() -> Iterator[tuple[str, int]]:
-    """Run ``hal serve``; yield its address and the number of its process."""
+def serve(address: str) -> Iterator[tuple[str, int]]:
+    """Run ``hal serve`` at an address; yield that with its port, and the number of its process."""
     changes = [word for change in CHANGES for word in ("--set", change)]
-    command = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", "127.0.0.1:0", *changes]
+    command = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", f"{address}:0", *changes]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
@@ -165,13 +170,20 @@ def local(quick: bool) -> Iterator[Table]:
     count, seconds = (20, 0.5) if quick else (2000, 5.0)
     with hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=CHANGES) as rig:
         results = {"one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}}
-    with serve() as (at, pid), hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
-        results["over a link"] = {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
-        results["over a link"]["round trip (ms)"] = 1e3 * rig.statistics()[at]["link"]["round_trip_s"]
-        host: Any = rig._hosts[0]
-        shares = measure_load(rig, (host.child.process.pid, pid), seconds)
-    for name, share in zip(("client", "server"), shares, strict=True):
-        results["over a link"][f"{name}, of a core (%)"] = 100.0 * share
+    with tempfile.TemporaryDirectory() as keys:
+        os.environ["HAL_KEYS"] = keys
+        make_key("host", "here", [WITH_TLS])
+        make_key("person", "me")
+        for name, address in (("over a link", "127.0.0.1"), ("with TLS", WITH_TLS)):
+            with serve(address) as (at, pid), hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
+                found: dict[str, Any] = {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
+                found["round trip (ms)"] = 1e3 * rig.statistics()[at]["link"]["round_trip_s"]
+                host: Any = rig._hosts[0]
+                shares = measure_load(rig, (host.child.process.pid, pid), seconds)
+            for end, share in zip(("client", "server"), shares, strict=True):
+                found[f"{end}, of a core (%)"] = 100.0 * share
+            results[name] = found
+        del os.environ["HAL_KEYS"]
     yield compare(f"From a command to its set-point, servo and commands at {RATE:g} Hz", results)
 
 

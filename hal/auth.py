@@ -25,8 +25,9 @@ class Authenticator:
     token, and a name of its own that it points to this machine (DNS rebinding) appears in ``Host``.
     """
 
-    def __init__(self, token: str, address: str, names: Collection[str]) -> None:
-        """``address`` is the one that the server listens at; ``names`` are those of this machine."""
+    def __init__(self, token: str, address: str, names: Collection[str], tls: bool = False) -> None:
+        """``address`` is the one that the server listens at, with TLS or without; ``names`` are this machine's."""
+        self._scheme = "https" if tls else "http"
         self._token = token.encode()
         self._loopback = is_loopback(address)
         others = () if self._loopback else names
@@ -46,7 +47,7 @@ class Authenticator:
 
     def is_own_origin(self, origin: str | None, host: str | None) -> bool:
         """Whether the page that opens a WebSocket was served at the address that it connects to."""
-        return origin is not None and host is not None and origin.lower() == f"http://{host.lower()}"
+        return origin is not None and host is not None and origin.lower() == f"{self._scheme}://{host.lower()}"
 
     def is_valid_token(self, offered: str | None) -> bool:
         """Whether the offered subprotocols contain the token."""
@@ -68,7 +69,7 @@ def is_loopback(address: str) -> bool:
         return address == "localhost"
 
 
-def page_link(address: str, port: int, token: str) -> str:
+def page_link(address: str, port: int, token: str, tls: bool = False) -> str:
     """Return the link of the page. The token is in the fragment, which browsers never send, log or pass on."""
     host = address
     try:
@@ -80,7 +81,7 @@ def page_link(address: str, port: int, token: str) -> str:
             host = socket.gethostname()
         elif ip.version == 6:
             host = f"[{address}]"
-    return f"http://{host}:{port}/#{token}"
+    return f"http{'s' if tls else ''}://{host}:{port}/#{token}"
 
 
 def ssh_tunnel(address: str, port: int) -> str:

@@ -23,6 +23,7 @@ from hal.errors import ConnectionLost, HalError
 from hal.gamepad import Gamepad
 from hal.host.process import Channel, Child, SharedMemory
 from hal.host.ring import frame_rings, frame_rings_size
+from hal.keys import find_credentials, needs_keys
 from hal.pads.keyboard import keyboard_table
 from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
 from hal.types import STREAMS, Frame
@@ -65,6 +66,7 @@ class WebConsole(Console):
         self._queues: list[PadQueue] = []
         self._token = secrets.token_urlsafe(_TOKEN_BYTES)
         self._address, self._port = listen.address, listen.port
+        self._tls = needs_keys(listen.address) and find_credentials("host") is not None
         self._watched: frozenset[str] = frozenset()
         self._waiting: tuple[str, ...] = ()
         self._loss = ("", "")
@@ -87,6 +89,7 @@ class WebConsole(Console):
             "viewer": rig.viewer3d.address if rig.viewer3d is not None else "",
             "listen": [listen.address, listen.port],
             "port_fixed": listen.fixed,
+            "tls": self._tls,
             "token": self._token,
             "names": host_names(),
             "keyboard": keyboard_table("browser")._asdict(),
@@ -106,13 +109,14 @@ class WebConsole(Console):
     def _warnings(self) -> tuple[str, ...]:
         if is_loopback(self._address):
             return ()
-        text = f"the console listens on {self._address}: anyone who has the link, or can read the network traffic, "
-        text += "can drive the REAL ARM" if self.rig.attended and not self.rig.emulated else "can drive"
-        return (text + "; nothing is encrypted (with an ssh tunnel it is: leave --listen out)",)
+        who = "anyone who has the link" if self._tls else "anyone who has the link, or can read the network traffic,"
+        what = "can drive the REAL ARM" if self.rig.attended and not self.rig.emulated else "can drive"
+        remedy = "; nothing is encrypted: `hal keys make --host NAME`, or leave --listen out and use an ssh tunnel"
+        return (f"the console listens on {self._address}: {who} {what}{'' if self._tls else remedy}",)
 
     @property
     def link(self) -> str:
-        return page_link(self._address, self._port, self._token)
+        return page_link(self._address, self._port, self._token, self._tls)
 
     @property
     def tunnel(self) -> str:

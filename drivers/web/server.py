@@ -12,6 +12,7 @@ import errno
 import json
 import os
 import socket
+import ssl
 import time
 import traceback
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -24,6 +25,7 @@ from hal.auth import Authenticator
 from hal.errors import ConnectionLost, DriverMissing, NotSupported
 from hal.host.process import Channel, SharedMemory
 from hal.host.ring import frame_rings
+from hal.keys import Credentials
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import CameraSpec, from_json
 from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
@@ -76,7 +78,10 @@ class ConsoleServer:
         self._socket = open_listener(self._address, int(port), fixed=bool(config["port_fixed"]))
         cameras = [from_json(CameraSpec, camera) for camera in config["cameras"]]
         pictures, *hosts = [memory.buffer for memory in memories]
-        auth = Authenticator(config["token"], self._address, config["names"])
+        auth = Authenticator(config["token"], self._address, config["names"], bool(config["tls"]))
+        self._tls = Credentials("host").context if config["tls"] else None
+        if self._tls is not None:
+            self._tls.verify_mode = ssl.CERT_NONE  # browsers have no certificate: the token in the link says who may
         self._telemetry = Telemetry(config["hosts"], hosts)
         self._cache = PictureCache(cameras, frame_rings(pictures, cameras))
         self._app_channel = AppChannel(channel, self._receive_from_app)
@@ -96,7 +101,7 @@ class ConsoleServer:
         assert runner.server is not None
         self._channel.send({"ready": {"address": self._address, "port": self._socket.getsockname()[1]}})
         self._app_channel.start()
-        accepting = asyncio.ensure_future(self._connections.accept_all(self._socket, runner.server))
+        accepting = asyncio.ensure_future(self._connections.accept_all(self._socket, runner.server, self._tls))
         sending = asyncio.ensure_future(self._send_states())
         ended = asyncio.ensure_future(self._app_channel.ended.wait())
         done, _ = await asyncio.wait((accepting, sending, ended), return_when=asyncio.FIRST_COMPLETED)
@@ -304,7 +309,8 @@ def make_app(
         host = request.headers.get("Host")
         if auth.is_known_host(host):
             policy = STAGE_POLICY if request.path.startswith("/3d/") else _POLICY
-            response.headers["Content-Security-Policy"] = policy.format(host=host)
+            sockets = "wss://" if request.secure else "ws://"
+            response.headers["Content-Security-Policy"] = policy.format(host=host).replace("ws://", sockets)
 
     async def serve_file(request: web.Request) -> web.StreamResponse:
         found = files.get(request.match_info.get("name", _INDEX))

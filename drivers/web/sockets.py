@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import ssl
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from aiohttp import WSMsgType, web
 
@@ -45,6 +47,8 @@ _UNSENT_BYTES = 16384
 """Bytes that the kernel keeps for a page that does not read. More would only grow old there."""
 _MAX_CONNECTIONS = 128
 """Connections that are not a page's socket. Sixteen pages that load at the same time have 96."""
+_MAX_HANDSHAKES = 32
+"""Handshakes of TLS at the same time; of more the oldest are given up."""
 _MAX_REQUESTS = 100
 """Requests that one of them may send in one second. A page needs a dozen."""
 _IDLE_TIME = 5.0
@@ -89,9 +93,13 @@ class ConnectionLimit:
         self._idle_time = idle_time
         self._since: dict[asyncio.Transport, tuple[float, RateLimit]] = {}
         """Time of the connection or of its last request, s, monotonic, and its requests; the oldest first."""
+        self._shaking: dict[asyncio.Future[None], None] = {}
+        """Handshakes of TLS, the oldest first."""
 
-    async def accept_all(self, sock: socket.socket, server: Callable[[], asyncio.Protocol]) -> None:
-        """Accept connections to ``sock`` until cancelled.
+    async def accept_all(
+        self, sock: socket.socket, server: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None = None
+    ) -> None:
+        """Accept connections to ``sock``, with TLS or without, until cancelled.
 
         One at a time, in turn with everything else: the messages of pages are read in between.
         """
@@ -103,12 +111,23 @@ class ConnectionLimit:
                 self._abort_oldest()
                 await asyncio.sleep(_RETRY_AFTER)
                 continue
-            try:
-                transport, _ = await loop.connect_accepted_socket(server, connection)
-            except OSError:
-                connection.close()  # it was closed meanwhile
-            else:
-                self._add(transport, time.monotonic())
+            if tls is None:
+                await self._start(server, connection)
+                continue
+            shaking = asyncio.ensure_future(self._start(server, connection, ssl=tls, ssl_handshake_timeout=_IDLE_TIME))
+            self._shaking[shaking] = None
+            shaking.add_done_callback(lambda done: self._shaking.pop(done, None))
+            if len(self._shaking) > _MAX_HANDSHAKES:
+                next(iter(self._shaking)).cancel()
+            await asyncio.sleep(0)
+
+    async def _start(self, server: Callable[[], asyncio.Protocol], connection: socket.socket, **tls: Any) -> None:
+        try:
+            transport, _ = await asyncio.get_running_loop().connect_accepted_socket(server, connection, **tls)
+        except OSError:
+            connection.close()  # it was closed meanwhile, or its handshake failed
+        else:
+            self._add(transport, time.monotonic())
 
     def _add(self, transport: asyncio.Transport, now: float) -> None:
         if len(self._since) >= self._most:
@@ -172,7 +191,7 @@ class PageSocket:
 
     def _minimise_buffers(self) -> None:
         """Let nothing wait in buffers: neither small messages for larger ones, nor old states for a slow page."""
-        self._transport.set_write_buffer_limits(high=0)
+        self._transport.set_write_buffer_limits(high=1)  # not 0, with which one of TLS never goes on
         sock = self._transport.get_extra_info("socket")
         with contextlib.suppress(OSError):  # it may be closed already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import ssl
 import threading
 import traceback
 from collections.abc import Callable, Coroutine, Mapping
@@ -20,7 +21,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import DriverMissing, PolicyError
+from ..errors import DriverMissing, HalError, PolicyError
+from ..keys import Credentials, find_credentials
 
 T = TypeVar("T")
 Message = dict[str, Any]
@@ -95,15 +97,19 @@ class PolicyClient:
         """Prepare a connection; :meth:`connect` opens it.
 
         Args:
-            url: ``ws://host:port`` or ``wss://host:port``.
+            url: ``ws://host:port``, or ``wss://host:port`` with the certificate of ``hal keys``, if there is one here.
             api_key: Key that the server asks for; empty for none.
             timeout: Longest wait for a reply, s.
 
         Raises:
             DriverMissing: aiohttp or msgpack is not installed.
+            NotSupported: The certificate here cannot be used, see :func:`~hal.keys.find_key`.
         """
         _msgpack(), _aiohttp()
         self.url = url
+        self._credentials = find_credentials("person") if url.startswith("wss:") else None
+        if self._credentials is not None:
+            self._credentials.context.load_default_certs()  # servers with a certificate for the whole world
         self.timeout = timeout
         self.metadata: Message = {}
         """What the server sent on connecting."""
@@ -165,13 +171,26 @@ class PolicyClient:
         self._session = aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_TIMEOUT))
         try:
             self._socket = await asyncio.wait_for(
-                self._session.ws_connect(self.url, compress=0, max_msg_size=LARGEST, headers=self._headers),
+                self._session.ws_connect(
+                    self.url,
+                    compress=0,
+                    max_msg_size=LARGEST,
+                    headers=self._headers,
+                    ssl=True if self._credentials is None else self._credentials.context,
+                ),
                 CONNECT_TIMEOUT,
             )
         except (aiohttp.ClientError, OSError, ValueError, asyncio.TimeoutError) as error:
             await self._disconnect()
+            if self._credentials is not None and (refusal := _find_tls_error(error)) is not None:
+                lost = self._credentials.explain(refusal, self.url)
+                raise PolicyError(str(lost), code=lost.code) from error
             cause = getattr(error, "os_error", None)  # of aiohttp, whose own text has its parameters
             reason = (cause and cause.strerror) or str(error) or "no answer"
+            if self._credentials is not None and isinstance(error, (aiohttp.ServerDisconnectedError, ConnectionError)):
+                reason += f" after the handshake. Has {self._credentials.file} expired, or another authority?"
+            elif self._credentials is None and self.url.startswith("wss:"):
+                reason += "; this user has no certificate of `hal keys`"
             raise PolicyError(f"no policy server at {self.url}: {reason}", code="policy_unreachable") from error
         self._listen()
         metadata = await self._receive(CONNECT_TIMEOUT)
@@ -266,6 +285,7 @@ class PolicyServer:
         metadata: Mapping[str, Any] | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
+        credentials: Credentials | None = None,
     ) -> None:
         """Prepare a server; :meth:`start`, or a ``with`` statement, starts it.
 
@@ -276,11 +296,13 @@ class PolicyServer:
             metadata: What a client gets on connecting.
             host: Address to listen at.
             port: Port; 0 for a free one.
+            credentials: ``Credentials("host")`` to encrypt, and answer only those who have a certificate.
 
         Raises:
             DriverMissing: aiohttp or msgpack is not installed.
         """
         _msgpack(), _aiohttp()
+        self._credentials = credentials
         self._infer, self._reset = infer, reset
         self._metadata = dict(metadata or {}) | ({} if reset is None else {"resets": True})
         self._host, self.port = host, port
@@ -294,7 +316,7 @@ class PolicyServer:
     @property
     def url(self) -> str:
         """Address for clients."""
-        return f"ws://{self._host}:{self.port}"
+        return f"ws{'s' if self._credentials else ''}://{self._host}:{self.port}"
 
     def start(self) -> PolicyServer:
         """Start to listen. Raises OSError if the port is taken."""
@@ -336,7 +358,8 @@ class PolicyServer:
         app.router.add_get("/", self._serve)
         self._runner = web.AppRunner(app, shutdown_timeout=0.1)
         await self._runner.setup()
-        site = web.TCPSite(self._runner, self._host, self.port)
+        context = None if self._credentials is None else self._credentials.context
+        site = web.TCPSite(self._runner, self._host, self.port, ssl_context=context)
         await site.start()
         self.port = site._server.sockets[0].getsockname()[1]
 
@@ -350,6 +373,12 @@ class PolicyServer:
             raise aiohttp.web.HTTPForbidden(text="a policy's server answers programs, not pages\n")
         socket = aiohttp.web.WebSocketResponse(compress=False, max_msg_size=LARGEST)
         await socket.prepare(request)
+        if self._credentials is not None:
+            try:
+                self._credentials.check(request.transport.get_extra_info("peercert"), str(request.remote))
+            except HalError as error:
+                await socket.send_str(f"{_ERROR}{error}")
+                return socket
         await socket.send_bytes(pack(self._metadata))
         with contextlib.suppress(ConnectionResetError):  # the client left before its answer
             async for message in socket:
@@ -384,6 +413,16 @@ def _aiohttp() -> Any:
     except ImportError as error:
         raise DriverMissing("a policy on a server needs aiohttp: pip install aiohttp", name="aiohttp") from error
     return aiohttp
+
+
+def _find_tls_error(error: BaseException | None) -> ssl.SSLError | None:
+    """Return the error of TLS that is behind one of aiohttp."""
+    while error is not None:
+        deeper = getattr(error, "certificate_error", None) or getattr(error, "os_error", None) or error.__cause__
+        if isinstance(error, ssl.SSLError) and deeper is None:
+            return error
+        error = deeper
+    return None
 
 
 def _server_error(text: str) -> PolicyError:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import socket
+import ssl
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from .. import registry
 from ..errors import ConnectionLost, HalError
 from ..host.process import Channel, ChannelClosed, SharedMemory, pack_error, unpack_error
 from ..host.records import GroupMemory
+from ..keys import Credentials, needs_keys
 from ..kinematics.composition import keep_urdf
 from ..specs import CameraSpec, GroupSpec, RobotSpec, from_json
 from .boxes import boxes_of_hosts, boxes_of_program
@@ -37,20 +40,34 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
         purpose: What the connection is for: ``{"want": "devices"}``, ``"control"`` or ``"frames"``.
 
     Raises:
-        ConnectionLost: Nothing answers there (``code`` is ``no_server``).
+        ConnectionLost: Nothing answers there (``code`` is ``no_server``); or a certificate is refused, see
+            :meth:`~hal.keys.Credentials.explain`.
+        NotSupported: There is no certificate here, see :func:`~hal.keys.find_key`.
         HalError: The server's refusal: another version (``version_mismatch``), or ``in_use``.
     """
+    name, port = split_address(at)
+    credentials = Credentials("person") if needs_keys(name) else None
     try:
-        sock = socket.create_connection(split_address(at), timeout=ANSWER_LIMIT)
+        sock = socket.create_connection((name, port), timeout=ANSWER_LIMIT)
     except OSError as error:
         text = f"nothing answers at {at} ({error.strerror or error}): start `hal serve --config RIG` on that computer"
         raise ConnectionLost(text, code="no_server") from None
+    if credentials is not None:
+        sock = secured = credentials.wrap(sock, name)
+        credentials.shake(secured, at)
     link = RigLink(sock, at)
     try:
+        if credentials is not None:
+            link.check = partial(credentials.check, secured.getpeercert(), at)
         link.post(describe_version() | purpose)
         answer = link.await_message()
         if "error" in answer:
             raise unpack_error(answer["error"])
+    except ConnectionLost as error:
+        link.close()
+        if credentials is not None and isinstance(error.__cause__, ssl.SSLError):  # what the server has against us
+            raise credentials.explain(error.__cause__, at) from None
+        raise
     except BaseException:
         link.close()
         raise

@@ -11,10 +11,11 @@ import ssl
 import struct
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import ConnectionLost
+from ..histogram import Histogram
 from ..host.records import LAYOUT
 from .boxes import Box
 
@@ -31,6 +32,8 @@ CLOSE_LIMIT = 60.0
 """Longest time that the devices may take to close, s."""
 _IDLE = 0.02
 """Longest time between two frames, s."""
+_CHECK_PERIOD = 1.0
+"""Time between two checks of the other end's certificate, s."""
 _LARGEST = 4 << 20
 """Size of the largest frame, bytes: a long path in a request."""
 _BUFFERED = 1 << 16
@@ -60,6 +63,12 @@ class ClockOffset:
     def __init__(self) -> None:
         self.low, self.high = -math.inf, math.inf
         self._t = math.nan
+        self.forget_round_trips()
+
+    def forget_round_trips(self) -> None:
+        """Begin new statistics of round trips."""
+        self.round_trips = Histogram(50e-6, 4000)
+        """Of all frames since then, s; the time at the other end is not counted."""
 
     def note(self, now: float, sent: float, heard: float, heard_at: float) -> None:
         """Take the stamps of a frame.
@@ -78,6 +87,7 @@ class ClockOffset:
         self.low, self.high = self.low - aged, min(self.high + aged, now - sent)
         if not math.isnan(heard):
             self.low = max(self.low, heard - heard_at)
+            self.round_trips.add((now - sent) - (heard - heard_at))
         if not self.low <= self.high:
             text = "the clocks of the two computers do not fit together any more: one of them was suspended or stepped"
             raise ConnectionLost(text, code="clock_stepped")
@@ -124,6 +134,9 @@ class RigLink:
         """Size of the largest frame that is taken, bytes."""
         self.took = 0.0
         """How long the connection took the newest frame with something new, s."""
+        self.check: Callable[[], object] = lambda: None
+        """Raises ConnectionLost when the other end's certificate is no longer valid; called once in a second."""
+        self._t_check = -math.inf
         self._sock = sock
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFERED)
@@ -143,6 +156,12 @@ class RigLink:
         self._heard = (math.nan, math.nan)
         """When that was sent, on the other end's clock, and when it came, s."""
         self._t_heard = time.monotonic()
+
+    @property
+    def tls(self) -> str:
+        """Version of TLS and the cipher; empty without."""
+        cipher = self._sock.cipher() if isinstance(self._sock, ssl.SSLSocket) else None
+        return f"{cipher[1]}, {cipher[0]}" if cipher is not None else ""
 
     def post(self, message: Any) -> None:
         """Send a message (JSON) with the next frame. It arrives after all records that are newer than it."""
@@ -170,9 +189,9 @@ class RigLink:
         try:
             while (body := self._take_frame(now)) is not None:
                 newest, message = self._split(body)
-                if records:  # a picture is in one frame only
+                if records and newest:  # a picture is in one frame only
                     newest = [new if new[1] else old for old, new in zip(records, newest, strict=True)]
-                records = newest
+                records = newest or records
                 if message:
                     messages.append(json.loads(message))
             if records and self.incoming and self.offset.known:
@@ -183,6 +202,9 @@ class RigLink:
             raise ConnectionLost(f"{self.at} sent what cannot be read: {error}", code="bad_frame") from error
         if now - self._t_heard > GONE:
             raise ConnectionLost(f"{self.at} has sent nothing for {now - self._t_heard:.1f} s", code="link_silent")
+        if now - self._t_check > _CHECK_PERIOD:
+            self._t_check = now
+            self.check()
         return messages
 
     def _read(self) -> None:
@@ -291,8 +313,10 @@ class RigLink:
             self.await_message()
 
     def statistics(self) -> dict[str, Any]:
-        """Return the round trip and the offset of the clocks, s, and the number of frames that were sent."""
-        return {"round_trip_s": self.offset.round_trip, "offset_s": self.offset.value, "frames": self.frames}
+        """Return the round trips and the offset of the clocks, s, and the number of frames that were sent."""
+        offset = self.offset
+        found = {"round_trip_s": offset.round_trip, "offset_s": offset.value, "frames": self.frames}
+        return {**found, "round_trips_s": offset.round_trips.summary()}
 
     def close(self) -> None:
         """Close the connection. Idempotent."""

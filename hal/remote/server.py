@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..auth import is_loopback
 from ..commands import NO_SESSION, DeadmanRecord, Session
 from ..errors import CommandError, ConnectionLost, ControlTaken, HalError, NotSupported
 from ..host.hosts import RemoteHost
@@ -23,8 +22,10 @@ from ..host.records import GripperMail, RobotMail
 from ..servo.watchdog import SILENCE
 from ..specs import CameraSpec, Plan, RobotSpec, to_json
 from .boxes import boxes_of_hosts, boxes_of_program
+from .entrance import Entrance
 from .frames import send_frames
 from .link import CLOSE_LIMIT, MOST_ROUND_TRIP, RigLink, describe_version
+from .measure import echo
 
 if TYPE_CHECKING:
     from ..rig import Rig
@@ -33,8 +34,6 @@ PERIOD = 0.002
 """Longest time from a new state to its frame, s."""
 _LEAVING = 1.0
 """Longest wait for a client that is about to leave, s."""
-_HANDSHAKES = 16
-"""Number of connections that may be about to say what they want; more are closed at once."""
 
 
 class Served:
@@ -96,7 +95,7 @@ class Served:
 
         Its arms come to rest before there is another sign of life, and its grippers stop for the lack of one.
         """
-        self.link.incoming = ()
+        self.link.incoming = self.link.outgoing = ()  # the end of its sessions is not news for it, the reason is
         arms = [mail for host in self.hosts for mail in host.memory.robots.values()]
         for mail in arms:
             mail.put_session(NO_SESSION)
@@ -179,18 +178,13 @@ class Server:
         report: Called with each line that a user should see.
 
     Raises:
-        NotSupported: An address that other computers reach (``code`` is ``no_certificates``), or a rig in lock-step
-            (``needs_real_time``).
+        NotSupported: An address other than 127.0.0.1, ::1 and localhost without a certificate (``code`` is
+            ``no_certificates``, or see :func:`~hal.keys.find_key`), or a rig in lock-step (``needs_real_time``).
         CommandError: There is nothing to serve (``code`` is ``no_devices``), or the port is taken (``bad_address``).
     """
 
     def __init__(self, rig: Rig, address: str, port: int, report: Callable[[str], object]) -> None:
-        if not is_loopback(address):
-            raise NotSupported(
-                f"{address} can be reached from other computers, and connections are not encrypted or authenticated "
-                "yet: listen at 127.0.0.1, and let the other computer come through `ssh -L`",
-                code="no_certificates",
-            )
+        self.entrance = Entrance(address, report)
         check_servable(rig.plan)
         self._rig = rig
         self._hosts = [host for host in rig._hosts if isinstance(host, RemoteHost)]
@@ -199,7 +193,6 @@ class Server:
         self._over = threading.Event()
         self.served: list[Served] = []
         """What is lent at present."""
-        self._waiting = threading.Semaphore(_HANDSHAKES)
         try:
             self._socket = socket.create_server(
                 (address, port), family=socket.AF_INET6 if ":" in address else socket.AF_INET
@@ -237,10 +230,9 @@ class Server:
                     if self._over.is_set():
                         return
                     raise
-                if not self._waiting.acquire(blocking=False):
-                    sock.close()
-                    continue
-                thread = threading.Thread(target=self._welcome, args=(sock, f"{peer[0]}:{peer[1]}"), daemon=True)
+                at = f"{peer[0]}:{peer[1]}"
+                self.entrance.enter(at, sock)
+                thread = threading.Thread(target=self._welcome, args=(sock, at), daemon=True)
                 thread.start()
                 threads = [other for other in threads if other.is_alive()] + [thread]
         finally:
@@ -251,21 +243,18 @@ class Server:
 
     def _welcome(self, sock: socket.socket, peer: str) -> None:
         """Serve one connection, in a thread of its own."""
-        link = RigLink(sock, peer, PERIOD)
+        link = None
         try:
-            try:
-                wish = link.await_message()
-            finally:
-                self._waiting.release()
-            self._serve(link, peer, wish)
-        except ConnectionLost as error:
-            self._report(f"{peer}: {error}")
+            link = self.entrance.admit(sock, peer, PERIOD)
+            self._serve(link, peer, link.await_message())
         except HalError as error:
-            self._report(f"{peer} is refused: {error}")
+            self.entrance.report(peer, error)
         except Exception:
             self._report(f"{peer}: {traceback.format_exc()}")
         finally:
-            link.close()
+            self.entrance.leave(peer)
+            if link is not None:
+                link.close()
 
     def _serve(self, link: RigLink, peer: str, wish: dict[str, Any]) -> None:
         want = wish["want"]
@@ -274,22 +263,36 @@ class Server:
             if want == "devices":
                 link.say_last(describe_devices(self._rig.plan))
                 return
-            if want == "frames":
-                send_frames(self._rig.cameras[wish["camera"]], link, self._over)
+            if want == "echo":
+                echo(link, self._over)
                 return
-            served = self._lend(link, wish)
+            if want != "frames":
+                served = self._lend(link, wish)
         except HalError as error:
             link.say_last({"error": pack_error(error)})
             raise
+        self.entrance.leave(peer)
         try:
-            link.post({"accepted": True})
-            self._report(f"{peer} has taken {', '.join(name for name, _ in wish['robots'])}")
+            if want == "frames":
+                send_frames(self._rig.cameras[wish["camera"]], link, self._over)
+            else:
+                self._run(served, ", ".join(name for name, _ in wish["robots"]))
+        except ConnectionLost as error:
+            self._report(f"{link.at}: {error}")
+            if want == "frames":
+                link.say_last({"error": pack_error(error)})
+
+    def _run(self, served: Served, names: str) -> None:
+        at = served.link.at
+        try:
+            served.link.post({"accepted": True})
+            self._report(f"{at} has taken {names}")
             served.run()
         finally:
             with self._leases:
                 self.served.remove(served)
                 self._leases.notify_all()
-            self._report(f"{peer} has left")
+            self._report(f"{at} has left")
 
     def _lend(self, link: RigLink, wish: dict[str, Any]) -> Served:
         """Lend the groups of a client's devices. Raises ControlTaken while another client has one of them."""

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from waiting import wait_until
@@ -20,6 +21,7 @@ import hal
 from hal.host.records import RobotMail, ServoRecord
 from hal.remote.server import Server
 
+ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import json, select, sys, time
 import hal
@@ -57,6 +59,16 @@ with hal.open({"robots": {"panda": {"at": sys.argv[1]}}}, pad="none") as rig:
 """
 """Drives the arm until it is told to end, holding its dead-man; says each stop."""
 _HEADER = struct.Struct("<IQddd")
+
+
+def start_server(*overrides: str, listen: str = "127.0.0.1:0") -> tuple[subprocess.Popen[str], str]:
+    """Start ``hal serve --sim``, without cameras unless it is overridden; return its process and its address."""
+    run = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", listen]
+    run += [word for override in overrides or ["cameras={}"] for word in ("--set", override)]
+    server = subprocess.Popen(run, stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    line = next(line for line in server.stdout if line.startswith("listening at "))
+    return server, line.removeprefix("listening at ").partition(",")[0]
 
 
 class DrivingProgram:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import ssl
 import struct
 import time
 from collections.abc import Callable
@@ -77,6 +78,7 @@ class App:
             "rig": {**known, "robots": [{"name": "arm"}], "cameras": [], **(rig or {})},
             "listen": ["127.0.0.1", 0],
             "port_fixed": False,
+            "tls": False,
             "token": TOKEN,
             "names": ["testbench"],
             "keyboard": keyboard_table("browser")._asdict(),
@@ -97,7 +99,9 @@ class App:
         ready = self.child.wait_ready(30.0)
         self._log = os.dup(self.child._log.fileno())
         self.port = int(ready["port"])
-        self.url = f"http://127.0.0.1:{self.port}"
+        self.tls: ssl.SSLContext | bool = True
+        """What pages trust."""
+        self.url = f"http{'s' * settings['tls']}://{settings['listen'][0]}:{self.port}"
 
     def __enter__(self) -> App:
         return self
@@ -174,7 +178,7 @@ class Page:
         self._session = aiohttp.ClientSession()
         try:
             self.ws = await self._session.ws_connect(
-                self.app.url + self._path, protocols=self._protocols, headers=self._headers
+                self.app.url + self._path, protocols=self._protocols, headers=self._headers, ssl=self.app.tls
             )
         except aiohttp.ClientError:
             await self._session.close()

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import socket
+import ssl
 from collections.abc import Iterator
+from pathlib import Path
 
 import aiohttp
 import pytest
 from web_kit import TOKEN, WAIT, App, Page
 
 from hal.drivers.web.server import read_page_files
+from hal.keys import make_key
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +117,26 @@ async def test_too_many_pages(app: App) -> None:
         assert (await another.next("hello"))["name"] == "page 17"
     for page in pages:
         await page.__aexit__()
+
+
+async def test_pages_of_another_computer_are_served_with_tls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many connections never finish their handshake."""
+    monkeypatch.setenv("HAL_KEYS", str(tmp_path))
+    make_key("host", "bench", ["127.0.0.2"])
+    with App(listen=["127.0.0.2", 0], tls=True) as app:
+        app.tls = ssl.create_default_context(cafile=str(tmp_path / "authority.crt"))
+        silent = [socket.create_connection(("127.0.0.2", app.port)) for _ in range(100)]
+        async with Page(app) as page:
+            await page.take()
+            await page.drive(buttons=1)
+            assert (await app.pad())["connected"]
+        with pytest.raises(aiohttp.WSServerHandshakeError):
+            async with Page(app, Origin=app.url.replace("https", "http")):
+                pass
+        async with aiohttp.ClientSession() as session, session.get(app.url, ssl=app.tls) as answer:
+            assert "wss://127.0.0.2" in answer.headers["Content-Security-Policy"]
+        with pytest.raises(aiohttp.ClientConnectorCertificateError):
+            async with aiohttp.ClientSession() as session, session.get(app.url):
+                pass
+        for sock in silent:
+            sock.close()

@@ -6,8 +6,6 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from link_kit import Bench, served_arm
+from link_kit import Bench, served_arm, start_server
 from operator_kit import Operator
 from recording_kit import small
 from waiting import wait_until
@@ -31,7 +29,6 @@ from hal.servo.watchdog import SILENCE
 from hal.types import RobotStatus, Trip
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).parents[2]
 LATE = 0.02
 """Of a process that a busy computer lets wait, s."""
 
@@ -64,16 +61,6 @@ def drive(rig: hal.Rig) -> dict[str, Any]:
         control.rearm()
         wait_until(lambda: control.trip is Trip.NONE, "acknowledged")
     return {"moved": moved, "streamed": streamed, "width": arm.gripper.state().width, "stop": stop.value.code}
-
-
-def start_server(*overrides: str) -> tuple[subprocess.Popen[str], str]:
-    """Start ``hal serve --sim``; return its process and its address."""
-    run = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", "127.0.0.1:0"]
-    run += [word for override in overrides or ["cameras={}"] for word in ("--set", override)]
-    server = subprocess.Popen(run, stdout=subprocess.PIPE, text=True)
-    assert server.stdout is not None
-    line = next(line for line in server.stdout if line.startswith("listening at "))
-    return server, line.removeprefix("listening at ").partition(",")[0]
 
 
 def test_the_same_program_drives_an_arm_of_another_computer() -> None:

@@ -1,0 +1,144 @@
+"""A served rig behind certificates, from the command line: those who may drive do, intruders see and move nothing."""
+
+from __future__ import annotations
+
+import json
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from errors_kit import raises_code
+from keys_kit import make_keys
+from link_kit import start_server
+
+import hal
+from hal.apps.check import main as check
+from hal.apps.keys import main
+from hal.errors import ConnectionLost, NotSupported
+from hal.keys import Credentials
+from hal.remote.client import split_address
+
+pytestmark = pytest.mark.slow
+ADDRESS = "127.0.0.2"
+STRANGERS = 300
+"""Connections of an intruder at the same time."""
+
+
+class Recorder:
+    """Passes connections on, and keeps what the client of the newest one sends."""
+
+    def __init__(self, to: tuple[str, int]) -> None:
+        self.sent = b""
+        self._server = socket.create_server((ADDRESS, 0))
+        self.at = f"{ADDRESS}:{self._server.getsockname()[1]}"
+        self._to = to
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        while True:
+            here, there = self._server.accept()[0], socket.create_connection(self._to)
+            self.sent = b""
+            threading.Thread(target=self._copy, args=(there, here), daemon=True).start()
+            threading.Thread(target=self._copy, args=(here, there, True), daemon=True).start()
+
+    def _copy(self, source: socket.socket, to: socket.socket, keep: bool = False) -> None:
+        try:
+            while data := source.recv(1 << 16):
+                self.sent += data if keep else b""
+                to.sendall(data)
+            to.shutdown(socket.SHUT_WR)
+        except OSError:
+            pass
+
+
+def send(to: tuple[str, int], data: bytes, context: ssl.SSLContext | None = None) -> bytes:
+    """Send bytes as a stranger; return what the server answers until it closes the connection."""
+    sock = socket.create_connection(to, timeout=20.0)
+    if context is not None:
+        sock = context.wrap_socket(sock)
+    answer = b""
+    try:
+        sock.sendall(data)
+        while more := sock.recv(1 << 16):
+            answer += more
+    except OSError:
+        pass
+    sock.close()
+    return answer
+
+
+def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_is_revoked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_keys(tmp_path, ADDRESS)
+    become: Callable[[str], None] = lambda who: monkeypatch.setenv("HAL_KEYS", str(tmp_path / who))  # noqa: E731
+    become("host")
+    server, at = start_server(listen=f"{ADDRESS}:0")
+    where: Any = split_address(at)
+    rig = {"robots": {"panda": {"at": at}}}
+    try:
+        for who, code in (
+            ("foreign person", "certificate_foreign"),
+            ("expired person", "certificate_expired"),
+            ("host as person", "certificate_wrong_role"),
+        ):
+            become(who)
+            with raises_code(ConnectionLost, code):
+                hal.open(rig, pad="none")
+        become("nobody")
+        with raises_code(NotSupported, "no_certificates"):
+            hal.open(rig, pad="none")
+
+        blind = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        blind.check_hostname, blind.verify_mode = False, ssl.CERT_NONE
+        assert send(where, b"\0" * 100, blind) == b"", "no certificate"
+        assert b"no_tls" in send(where, b"\0\0\0\x40" + b"\0" * 1000), "1 GB without TLS"
+        idle = [socket.create_connection(where) for _ in range(STRANGERS)]  # more than may wait; none says anything
+
+        become("person")
+        tap = Recorder(where)
+        with hal.open({"robots": {"panda": {"at": tap.at}}}, pad="none") as one:
+            arm = one.robots["panda"]
+            arm.move_to(arm.home + [0.1, 0, 0, 0, 0, 0, 0], speed=0.5)
+            moved = arm.state().q[0] - arm.home[0]
+            assert moved > 0.09
+            rest = arm.state().q_set
+            assert send(where, tap.sent) != b"", "replayed, answered with a handshake that nobody can finish"
+            secured = Credentials("person").wrap(socket.create_connection(where), ADDRESS)
+            secured.do_handshake()
+            secured.sendall(b"\0\0\0\x40" + b"\0" * 1000)  # 1 GB of somebody with a certificate
+            secured.settimeout(20.0)
+            while secured.recv(1 << 16):
+                pass
+            assert (arm.state().q_set == rest).all()
+            capsys.readouterr()
+            assert check(["--at", at, "--duration", "0.3", "--json"]) == 0, "the link, while somebody drives over it"
+            measured = json.loads(capsys.readouterr().out)
+            assert len(measured["link"]["round_trips"]) >= 20
+            assert abs(measured["link"]["offset"]) <= measured["link"]["shortest"] / 2.0, "one computer has one clock"
+            assert measured["verdicts"][0]["found"].startswith("TLSv1.3")
+            with pytest.raises(ConnectionLost, match="anna is revoked"), arm.control() as control:
+                control.send(hal.JointVelocity([0.0] * 7))
+                (tmp_path / "host" / "certificates.txt").write_text(revoke(tmp_path, "anna"))
+                while True:
+                    control.send(hal.JointVelocity([0.0] * 7))
+                    time.sleep(0.01)
+        with raises_code(ConnectionLost, "certificate_revoked"):
+            hal.open(rig, pad="none")
+        assert server.poll() is None
+        del idle
+    finally:
+        server.kill()
+
+
+def revoke(root: Path, name: str) -> str:
+    """Revoke a certificate at the authority; return the list."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HAL_KEYS", str(root / "home"))
+        assert main(["revoke", name]) == 0
+    return (root / "home" / "certificates.txt").read_text()
