@@ -151,7 +151,8 @@ def read_list(folder: Path | None = None) -> list[Certificate]:
         words = line.split()
         if len(words) not in (4, 5) or words[4:] not in ([], ["revoked"]):
             raise CommandError(f"{file} has a line that is none of hal keys: {line!r}", code="bad_key_list")
-        found.append(Certificate(*words[:4], len(words) == 5))
+        serial, role, name, until = words[:4]
+        found.append(Certificate(serial, role, name, until, len(words) == 5))
     return found
 
 
@@ -266,7 +267,7 @@ class Credentials:
         Raises:
             ConnectionLost: It was revoked (code ``certificate_revoked``) or has expired (``certificate_expired``).
         """
-        name = next(value for part in certificate["subject"] for key, value in part if key == "commonName")
+        name: str = next(value for part in certificate["subject"] for key, value in part if key == "commonName")
         if any(line.revoked and line.serial == certificate["serialNumber"] for line in read_list(self.file.parent)):
             text = f"the certificate of {name} is revoked, {at} is refused: `hal keys make` makes a new one"
             raise ConnectionLost(text, code="certificate_revoked")

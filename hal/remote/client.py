@@ -58,7 +58,7 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
     link = RigLink(sock, at)
     try:
         if credentials is not None:
-            link.check = partial(credentials.check, secured.getpeercert(), at)
+            link.check = partial(credentials.check, secured.getpeercert() or {}, at)
         link.post(describe_version() | purpose)
         answer = link.await_message()
         if "error" in answer:
