@@ -95,7 +95,7 @@ class Executor:
         reports.lag = int(word)
 
     def _report_noise(self, words: Words) -> None:
-        self._server.arm.reports.noise = read_number(*_exactly(words, 1), 0.0, 1.0)
+        self._server.arm.reports.noise = read_number(_exactly(words, 1)[0], 0.0, 1.0)
 
     def _report_measured(self, words: Words) -> None:
         self._server.arm.reports.measured = read_switch(*_exactly(words, 1))
@@ -172,4 +172,4 @@ def _exactly(words: Words, count: int) -> Words:
 
 
 def _seconds(words: Words) -> float:
-    return read_number(*_exactly(words, 1), 0.0, _MAX_DURATION)
+    return read_number(_exactly(words, 1)[0], 0.0, _MAX_DURATION)
