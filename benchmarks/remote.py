@@ -164,7 +164,9 @@ def local(quick: bool) -> Iterator[Table]:
     """Yield the table over loopback."""
     count, seconds = (20, 0.5) if quick else (2000, 5.0)
     with hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=CHANGES) as rig:
-        results = {"one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}}
+        results: dict[str, dict[str, Any]] = {
+            "one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
+        }
     with serve() as (at, pid), hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
         results["over a link"] = {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
         results["over a link"]["round trip (ms)"] = 1e3 * rig.statistics()[at]["link"]["round_trip_s"]
