@@ -169,7 +169,9 @@ def local(quick: bool) -> Iterator[Table]:
     """Yield the table over loopback."""
     count, seconds = (20, 0.5) if quick else (2000, 5.0)
     with hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=CHANGES) as rig:
-        results = {"one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}}
+        results: dict[str, dict[str, Any]] = {
+            "one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
+        }
     with tempfile.TemporaryDirectory() as keys:
         os.environ["HAL_KEYS"] = keys
         make_key("host", "here", [WITH_TLS])

@@ -93,7 +93,8 @@ class Ends:
 def test_only_the_newest_frame_is_sent_while_the_connection_takes_none() -> None:
     spec = camera(1280, 960)
     ends = Ends(spec)
-    found, deadline = [], time.monotonic() + 20.0
+    found: list[int] = []
+    deadline = time.monotonic() + 20.0
     for seq in range(1, 6):
         ends.taken(picture(spec, seq))
         ends.here.send()
