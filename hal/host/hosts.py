@@ -116,8 +116,6 @@ SILENT = 1.5
 state.)"""
 CLOSE_LIMIT = 8.0
 """Longest time that one arm's driver may take to close, s: an arm without brakes is lowered slowly first."""
-PAD_PERIOD = 0.01
-"""Period at which pads are polled in lock-step, simulated s."""
 
 
 class Host(ABC):
@@ -186,10 +184,9 @@ class LocalHost(Host):
         self.cycle = Cycle(spec, self.memory, [other.memory for other in others])
         self.cycle.turn = self._step
         self.pollers: list[Callable[[float], object]] = []
-        """Functions (pads) that are called with the time, every :data:`PAD_PERIOD` of simulated time."""
+        """Functions (pads) that are called with the time in every step."""
         self._busy = threading.RLock()
         """Held while time advances: in one thread only."""
-        self._next_poll = 0.0
         self._closed = False
         self.cycle.open(0.0)
         self.memory.host.write(0.0, 0, 0, True)
@@ -215,10 +212,8 @@ class LocalHost(Host):
     def _step(self) -> None:
         cycle = self.cycle
         now = (cycle.ticks + 1) * cycle.dt
-        if now >= self._next_poll:
-            for poll in self.pollers:
-                poll(now)
-            self._next_poll = now + PAD_PERIOD
+        for poll in self.pollers:
+            poll(now)
         for other in self._others:
             other.advance_to(now)
         cycle.step(now, AppRecord(now, self.latch.stops))

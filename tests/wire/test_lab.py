@@ -144,6 +144,8 @@ def test_it_names_a_model_that_has_no_emulator_and_knows_the_address_of_localhos
     assert arm.arguments[1:5] == ["--robot", "ur5e", "--host", "127.0.0.1"]
     (arm,) = list_emulators("xarm7")
     assert arm.arguments == ["xarm", "--robot", "xarm7", "--host", "127.0.0.3", "--config", "xarm7"]
+    (arm,) = list_emulators("xarm7", ["robots.arm.model=lite6"])
+    assert arm.arguments[:3] == ["xarm", "--robot", "lite6"]
     model = tmp_path / "my_ur16e.yaml"
     model.write_bytes(find_data("robots", "ur5e.yaml").read_bytes())
     with pytest.raises(ValueError, match=r"arm: .*my_ur16e.* has no emulator, only ur10, ur10e, ur16e"):

@@ -16,6 +16,7 @@ from hal.specs import RobotSpec
 from hal_emulators.control import note_signals
 from hal_emulators.shared_world import find_address, has_world, load_real
 from hal_emulators.ur.motion import ROBOTS
+from hal_emulators.xarm.controller import ROBOTS as XARMS
 
 _END = 10.0
 """Longest time that the emulators take to end, s."""
@@ -80,7 +81,8 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
             raise ValueError(f"{arm.name}: its model {arm.model} has no emulator, only {known}")
         return Emulator(arm.name, ["ur", "--robot", arm.model, *options])
     if driver == "xarm":
-        return Emulator(arm.name, ["xarm", "--robot", f"xarm{len(arm.joints)}", *options])
+        robot = arm.model if arm.model in XARMS else f"xarm{len(arm.joints)}"  # a model of one's own
+        return Emulator(arm.name, ["xarm", "--robot", robot, *options])
     bare = arm.gripper is None or arm.gripper.driver != driver
     hand = ["--end-effector", "none", "--no-hand"] if bare else []
     return Emulator(arm.name, ["franka", "--robot", _FRANKA[arm.options["arm"]], *hand, *options])
