@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from hal import registry
 from hal.apps._display import list_devices
-from hal.errors import CommandError, DeviceNotFound, HalError
+from hal.errors import CommandError, ConnectionLost, DeviceNotFound, HalError
 from hal.registry import ENGINES
 from hal.types import STREAMS
 
@@ -248,7 +248,11 @@ def resolve_plan(
     from hal.config import load
     from hal.config.files import suggest
 
-    plan = load(**config_options(args), clock=clock).resolve()
+    try:
+        plan = load(**config_options(args), clock=clock).resolve()
+    except ConnectionLost as error:
+        error.args = (f"{error}" + "; --sim --dry-run checks this rig without it" * args.dry_run,)
+        raise
     robots = [robot.name for robot in plan.robots]
     for name in robot_names(args):
         if name not in robots:
@@ -491,6 +495,8 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
         return 130
     finally:
         link.disabled = before
+        if argv is None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # a further Ctrl-C would be a traceback of Python's own end
 
 
 def _report_failure(message: str) -> int:

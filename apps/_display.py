@@ -57,9 +57,9 @@ def list_devices(plan: Plan) -> list[str]:
         if robot.attended:
             lines.append(f"limits   {robot.name:10s} {_limits(robot)}")
     for camera in plan.cameras:
-        streams = "+".join(camera.streams)
+        streams, at = "+".join(camera.streams), "" if camera.at is None else f" at {camera.at}"
         lines.append(
-            f"camera   {camera.name:10s} {camera.model} ({camera.driver}{_image_source(camera)}), "
+            f"camera   {camera.name:10s} {camera.model}{at} ({camera.driver}{_image_source(camera)}), "
             f"{camera.width}x{camera.height} {streams} at {camera.rate_hz:g} Hz"
         )
     lines.extend(f"{pad.kind:8s} {pad.name:10s} {_pad(pad)}" for pad in plan.pads)

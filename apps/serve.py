@@ -1,10 +1,10 @@
-"""Serve the arms and grippers of a rig to a program on another computer, whose rig has ``at: ADDRESS`` for them.
+"""Serve the arms, grippers and cameras of a rig to programs on other computers: ``at: ADDRESS`` in their rigs.
 
 hal serve --config arm.yaml
 hal serve --config panda_table --sim --listen 127.0.0.1:7447
 
-The devices are opened for a client and closed, at rest, when it leaves. Nothing moves without a control session of the
-client's program. One client at a time.
+The devices stay open until the server ends. An arm belongs to one program at a time, and comes to rest when that one
+leaves; nothing moves without a control session of the program. Any number of them may watch a camera.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import argparse
 import sys
 
 from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, program
-from hal.apps._display import list_devices
+from hal.apps._display import banner
 from hal.apps.check import may_open
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="hal serve", description="Serve the arms of this computer to a program on another one."
+        prog="hal serve", description="Serve the arms and cameras of this computer to programs on others."
     )
     add_config_options(made)
     made.add_argument(
@@ -35,23 +35,28 @@ def parser() -> argparse.ArgumentParser:
 @program(parser)
 def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
+    import hal
     from hal.config import load
     from hal.remote.link import PORT
-    from hal.remote.server import Server
+    from hal.remote.server import Server, check_servable
     from hal.views import Listen
 
     listen = Listen.parse(args.listen)
     plan = load(**config_options(args)).resolve()
+    check_servable(plan)
     if not may_open(plan):
         return ACTION_NEEDED
-    server = Server(plan, listen.address, listen.port if listen.fixed else PORT, _report)
-    for line in list_devices(plan):
-        if line.startswith(("robot", "limits", "world")):
-            _report(f"  {line}")
-    keys = server.entrance.credentials
-    who = "reachable from this computer only" if keys is None else f"for those with a certificate, as {keys.file.stem}"
-    _report(f"listening at {server.address}:{server.port}, {who}; Ctrl-C ends")
-    server.run()
+    with hal.open(**config_options(args), pad="none") as rig:
+        server = Server(rig, listen.address, listen.port if listen.fixed else PORT, _report)
+        _report(banner(rig))
+        keys = server.entrance.credentials
+        who = (
+            "reachable from this computer only"
+            if keys is None
+            else f"for those with a certificate, as {keys.file.stem}"
+        )
+        _report(f"listening at {server.address}:{server.port}, {who}; Ctrl-C ends")
+        server.run()
     return 0
 
 

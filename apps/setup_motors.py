@@ -18,7 +18,7 @@ from typing import Any
 from hal import registry
 from hal.apps._common import add_config_options, check_one_robot, config_options, program, robot_names
 from hal.errors import CommandError, DeviceNotFound, NotSupported
-from hal.specs import RobotSpec
+from hal.specs import PadSpec, RobotSpec
 
 _PERIOD = 0.02
 """Time between two looks at the motors while joints are moved by hand, s."""
@@ -28,11 +28,11 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of ``setup-motors``."""
     made = argparse.ArgumentParser(
         prog="hal setup-motors",
-        description="Give each motor of an arm on a servo bus (Feetech, Dynamixel), and of its gripper, the id and the "
-        "rate that the rig has for it. The motors are connected alone, one after the other.",
+        description="Give each motor of an arm or a leader on a servo bus (Feetech, Dynamixel), and of a gripper, the "
+        "id and the rate that the rig has for it. The motors are connected alone, one after the other.",
     )
     add_config_options(made)
-    made.add_argument("--robot", metavar="NAME", help="the arm (default: the first)")
+    made.add_argument("--robot", metavar="NAME", help="the arm, or the leader (default: the first arm)")
     return made
 
 
@@ -54,7 +54,7 @@ def arm_parser() -> argparse.ArgumentParser:
 @program(parser)
 def main(args: argparse.Namespace) -> int:
     """Run ``hal setup-motors``; return the exit status."""
-    with _open_service(args) as service:
+    with _open_service(args, leaders=True) as service:
         for motor in service.motors:
             _ask(f"connect only the motor of {motor.name} (id {motor.id}), then press Enter")
             print(f"  {motor.name}: has the id {motor.id} now, {service.set_up(motor)}", flush=True)
@@ -89,13 +89,14 @@ def calibrate_arm(args: argparse.Namespace) -> int:
     return 0
 
 
-def _open_service(args: argparse.Namespace) -> Any:
-    """Return the motors of the arm that the options name, as its driver opens them. Raises HalError."""
+def _open_service(args: argparse.Namespace, leaders: bool = False) -> Any:
+    """Return the motors of the arm, or the leader, that the options name, as its driver opens them. Raises HalError."""
     from hal.config import load
 
     check_one_robot(args)
     plan = load(**config_options(args)).resolve()
-    arms: dict[str, RobotSpec] = {robot.name: robot for robot in plan.robots}
+    arms: dict[str, RobotSpec | PadSpec] = {robot.name: robot for robot in plan.robots}
+    arms |= {pad.name: pad for pad in plan.pads if leaders and pad.leader is not None}
     name = next(iter(robot_names(args)), next(iter(arms)))
     if name not in arms:
         raise DeviceNotFound(f"--robot: this rig has no robot {name!r}")

@@ -104,12 +104,6 @@ def median_ratio(some: Sequence[float], others: Sequence[float]) -> float:
 # Processes.
 
 
-def cpu(pid: int) -> float:
-    """Return the processor time that a process has used, s."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / 100.0
-
-
 @contextlib.contextmanager
 def ticks_missed(rig: hal.Rig) -> Iterator[dict[str, float]]:
     """Yield a dict that has the ``ticks`` and the share ``missed`` of the rig's first group, in %, after the block."""

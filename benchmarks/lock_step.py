@@ -1,10 +1,11 @@
-"""Policy steps per second in lock-step, beside PyBullet as a user writes it by hand.
+"""Policy steps per second in lock-step, beside the physics engine as a user writes it by hand.
 
-The reference is a short script with PyBullet's own functions: the same bodies in a client of its own with PyBullet's
-default settings, one setJointMotorControlArray, twelve stepSimulation and one getJointStates per policy step. It moves
-the joints directly, so it computes no inverse kinematics for the rows with twists and poses either. "Motors written at
+On PyBullet the reference is a short script with its own functions: the same bodies in a client of its own with default
+settings, one setJointMotorControlArray, twelve stepSimulation and one getJointStates per policy step. It moves the
+joints directly, so it computes no inverse kinematics for the rows with twists and poses either. "Motors written at
 every physics step" is the same script with motors written and joints read at every physics step, as any servo must.
-With two 256x256 RGB-D cameras the script draws with PyBullet's own renderer (TinyRenderer, no shadows).
+With two 256x256 RGB-D cameras the script draws with PyBullet's own renderer (TinyRenderer, no shadows). On MuJoCo the
+reference is the rig's own model, with torques written and joints read at every physics step.
 """
 
 from __future__ import annotations
@@ -20,9 +21,17 @@ import hal
 from hal.drivers.pybullet.loading import loadable_urdf
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
-from .kit import Table, median, median_ratio, per_second, run_in_turns
+from .kit import ENGINES, Table, median, median_ratio, per_second, run_in_turns
 
-PATHS = ("hal/servo", "hal/host", "hal/control.py", "hal/kinematics", "drivers/pybullet", "drivers/scene")
+PATHS = (
+    "hal/servo",
+    "hal/host",
+    "hal/control.py",
+    "hal/kinematics",
+    "drivers/pybullet",
+    "drivers/mujoco",
+    "drivers/scene",
+)
 POLICY_HZ = 20.0
 CONFIG = "panda_table"
 TURN = 0.2
@@ -33,13 +42,14 @@ HOVER = [0.42, 0.0, 0.35]
 Step = Callable[[], None]
 
 
-def ours(kind: str, cameras: bool) -> tuple[Step, hal.Rig]:
+def ours(engine: str, kind: str, cameras: bool) -> tuple[Step, hal.Rig]:
     """Return one policy step through the public interface with commands of this kind, and the rig to close."""
-    rig = hal.open(CONFIG, sim=True, clock="lock_step", overrides=() if cameras else ["cameras={}"], pad="none")
+    bare = () if cameras else ("cameras={}",)
+    rig = hal.open(CONFIG, sim=True, engine=engine, clock="lock_step", overrides=bare, pad="none")
     arm = rig.robots["panda"]
     if kind != "joints":
         arm.move_to(hal.Pose(HOVER, [1, 0, 0, 0]), speed=0.5)
-    control = arm.control(rate_hz=POLICY_HZ)
+    control = arm.control(rate_hz=POLICY_HZ, controller=hal.OperationalSpace() if kind == "torques" else None)
     control.__enter__()
     start, ticks = arm.state().q, rig.clock.rate(POLICY_HZ)
     phases = np.arange(arm.n)
@@ -48,7 +58,7 @@ def ours(kind: str, cameras: bool) -> tuple[Step, hal.Rig]:
     def command(t: float) -> hal.Command:
         if kind == "joints":
             return hal.JointTarget(start + 0.05 * np.sin(t + phases) - 0.05 * np.sin(phases))
-        if kind == "twists":
+        if kind in ("twists", "torques"):
             return hal.Twist([0.05 * np.cos(t), 0.05 * np.sin(t), 0.05 * np.cos(2 * t)])
         circle = np.array([np.sin(t), 1.0 - np.cos(t), np.sin(2 * t) / 2])
         return hal.CartesianTarget(hal.Pose(middle + 0.05 * circle, [1, 0, 0, 0]))
@@ -115,6 +125,24 @@ def by_hand(spec: WorldSpec, cameras: bool, every_tick: bool = False) -> Iterato
     p.disconnect(c)
 
 
+def mujoco_by_hand(rig: hal.Rig) -> Step:
+    """Return one policy step written with MuJoCo's own functions."""
+    import mujoco
+
+    arm = rig.robots["panda"]
+    model = arm._host.cycle.world.model
+    data, substeps = mujoco.MjData(model), round(1.0 / model.opt.timestep / POLICY_HZ)
+    data.qpos[: arm.n] = arm.state().q
+
+    def step() -> None:
+        for _ in range(substeps):
+            data.qfrc_applied[: arm.n] = data.qfrc_bias[: arm.n]
+            mujoco.mj_step(model, data)
+            data.qpos[: arm.n].tolist()
+
+    return step
+
+
 def place_by_hand(p: Any, c: int, body: BodySpec) -> None:
     """Put an object of the rig into a client."""
     if body.shape == "urdf":
@@ -148,11 +176,15 @@ def load_by_hand(p: Any, c: int, arm: RobotSpec) -> tuple[int, list[int], list[i
 
 
 ROWS = {
-    "joint targets": ("joints", False, False),
-    "twists": ("twists", False, False),
-    "poses": ("poses", False, False),
-    "joint targets; motors written at every physics step": ("joints", False, True),
-    "two 256x256 RGB-D cameras": ("joints", True, False),
+    "joint targets": ("pybullet", "joints", False, False),
+    "twists": ("pybullet", "twists", False, False),
+    "poses": ("pybullet", "poses", False, False),
+    "joint targets; motors written at every physics step": ("pybullet", "joints", False, True),
+    "two 256x256 RGB-D cameras": ("pybullet", "joints", True, False),
+    "MuJoCo, joint targets": ("mujoco", "joints", False, True),
+    "MuJoCo, twists": ("mujoco", "twists", False, True),
+    "MuJoCo, poses": ("mujoco", "poses", False, True),
+    "MuJoCo, twists with OperationalSpace": ("mujoco", "torques", False, True),
 }
 
 
@@ -162,10 +194,16 @@ def run(quick: bool) -> Iterator[Table]:
     table = Table(
         f"policy steps/s at 20 Hz over 240 Hz, medians of {rounds} turns", ("", "robot-hal", "by hand", "ratio")
     )
-    for name, (kind, cameras, every_tick) in ROWS.items():
-        step, rig = ours(kind, cameras)
+    for name, (engine, kind, cameras, every_tick) in ROWS.items():
+        if engine not in ENGINES:
+            continue
+        step, rig = ours(engine, kind, cameras)
         assert rig.plan.world is not None
-        with rig, by_hand(rig.plan.world, cameras, every_tick) as reference:
+        with rig, contextlib.ExitStack() as stack:
+            if engine == "mujoco":
+                reference = mujoco_by_hand(rig)
+            else:
+                reference = stack.enter_context(by_hand(rig.plan.world, cameras, every_tick))
             pair = {"ours": step, "theirs": reference}
             measures = {key: lambda call=call: per_second(call, TURN) for key, call in pair.items()}
             run_in_turns(measures, 1)

@@ -1,22 +1,24 @@
-"""A rig over two computers, here over loopback: from a command to its set-point; processor time of the link."""
+"""A rig over two computers, over loopback and over networks in namespaces: delays, trips, pictures, processor time."""
 
 from __future__ import annotations
 
+import math
 import os
 import random
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import hal
 from hal.keys import make_key
 
-from .kit import ROOT, Table, compare, ms
+from ._network import SERVER, run_apart
+from .kit import ROOT, Table, compare, cpu, ms
 
 PATHS = ("hal/remote/", "hal/keys.py")
 RATE = 1000.0
@@ -63,25 +65,113 @@ def measure_load(rig: hal.Rig, pids: tuple[int, int], seconds: float) -> list[fl
     """Return the shares of a core that two processes take while commands are sent at 1 kHz."""
     with rig.robots["panda"].control(rate_hz=10) as control:
         control.send(TURN)
-        before, began, sent = [_cpu(pid) for pid in pids], time.monotonic(), 0
+        before, began, sent = [cpu(pid) for pid in pids], time.monotonic(), 0
         while (now := time.monotonic()) < began + seconds:
             control.send(TURN)
             sent += 1
             time.sleep(max(0.0, began + sent / RATE - now))
-        return [(_cpu(pid) - start) / (now - began) for pid, start in zip(pids, before, strict=True)]
+        return [(cpu(pid) - start) / (now - began) for pid, start in zip(pids, before, strict=True)]
 
 
-def _cpu(pid: int) -> float:
-    """Return the processor's time of a process, s."""
-    runs = Path(f"/proc/{pid}/task").glob("*/schedstat")
-    return sum(int(run.read_text().split()[0]) for run in runs) / 1e9
+SERVE_CAMERAS = f"""
+import hal
+from hal.remote.server import Server
+cameras = {{"model": "realsense_d435", "capture": {{"width": 640, "height": 480, "rate_hz": 30}}}}
+cameras |= {{"look_at": {{"target": [0, 0, 0], "distance": 1.0}}}}
+changes = {{"cameras": {{"one": cameras, "two": cameras}}, "objects": []}}
+with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=changes) as rig:
+    server = Server(rig, "{SERVER}", 7447, print)
+    print("listening", flush=True)
+    server.run()
+"""
 
 
-def run(quick: bool = False) -> Iterator[Table]:
-    """Yield the tables."""
+def find_delays(count: int) -> dict[str, Any]:
+    """Return the delays of commands to the server of the other namespace."""
+    with hal.open({"robots": {"panda": {"at": SERVER}}}, pad="none") as rig:
+        found = {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
+        return found | {"round trip (ms)": 1e3 * rig.statistics()[SERVER]["link"]["round_trip_s"]}
+
+
+def find_trips(seconds: float) -> dict[str, Any]:
+    """Return the trips of a stream, and the greatest share of a limit that a set-point took."""
+    trips: Counter[str] = Counter()
+    with hal.open({"robots": {"panda": {"at": SERVER}}}, pad="none") as rig:
+        arm = rig.robots["panda"]
+        start = arm.state().q[0]
+        with arm.control(rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                if tick.elapsed > seconds:
+                    break
+                try:
+                    control.send(hal.JointVelocity([0.3 * math.sin(2.0 * tick.elapsed), *[0.0] * 6]))
+                except hal.MotionStopped as stop:
+                    trips[stop.code] += 1
+                    control.rearm()
+            moved = abs(arm.state().q[0] - start)
+        peak = max(rig.statistics()[SERVER]["robots"]["panda"]["peak"].values())
+    return {"trips": dict(trips), "moved (rad)": moved, "greatest share of a limit": peak}
+
+
+def find_ages(seconds: float, cameras: tuple[str, ...]) -> dict[str, Any]:
+    """Return the ages of states and frames of the other namespace at a program that reads them 200 times a second."""
+    rig_file = {"robots": {"panda": {"at": SERVER}}, "cameras": {name: {"at": SERVER} for name in cameras}}
+    with hal.open(rig_file, pad="none") as rig:
+        ages = []
+        for tick in rig.clock.rate(200):
+            if tick.elapsed > seconds:
+                break
+            ages.append(rig.clock.now() - rig.robots["panda"].state().stamp.t)
+        found: dict[str, Any] = {"states, median, 99 % (ms)": ms(ages, 0.5, 0.99), "oldest state (ms)": 1e3 * max(ages)}
+        for name, camera in rig.cameras.items():
+            counts, there = camera.counts(), rig.driver(name).statistics()
+            found[f"{name}: frames a second"] = counts.fps
+            found[f"{name}: age, median (ms)"] = 1e3 * (counts.age_p50 or math.nan)
+            found[f"{name}: uncertainty of its time (ms)"] = 500.0 * there["round_trip_s"]
+        return found
+
+
+def apart(
+    serve: Sequence[str], find: Callable[..., dict[str, Any]], *arguments: Any, **network: float
+) -> dict[str, Any]:
+    """Return what a function of this file finds in the namespace of a client."""
+    program = f"import json; from benchmarks import remote; print(json.dumps(remote.{find.__name__}(*{arguments!r})))"
+    found: dict[str, Any] = run_apart(serve, [sys.executable, "-c", program], **network)
+    return found
+
+
+def networks(quick: bool) -> Iterator[Table]:
+    """Yield the tables over networks in namespaces."""
+    changes = [word for change in CHANGES for word in ("--set", change)]
+    arm = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", SERVER, *changes]
+    count, seconds = (20, 1.0) if quick else (1000, 10.0)
+    ways = {"0.3 ms": (0.00015, 0.0), "20 ms": (0.01, 0.0), "100 ms, jitter 20 ms": (0.05, 0.01)}
+    yield compare(
+        "The same over a network with this round trip",
+        {name: apart(arm, find_delays, count, delay=delay, jitter=jitter) for name, (delay, jitter) in ways.items()},
+    )
+    worse = {"5 % loss, 20 ms": (0.01, 0.0), "5 % loss, 60 ms, jitter 20 ms": (0.03, 0.01)}
+    yield compare(
+        f"A stream of {seconds:g} s at 50 Hz",
+        {name: apart(arm, find_trips, seconds, delay=d, jitter=j, loss=0.05) for name, (d, j) in worse.items()},
+    )
+    both = [sys.executable, "-c", SERVE_CAMERAS]
+    yield compare(
+        "A mock arm and two RGB-D cameras, 640x480 at 30 Hz, over 1 Gbit/s",
+        {
+            "without cameras": apart(both, find_ages, seconds, (), rate=1e9),
+            "with both": apart(both, find_ages, seconds, ("one", "two"), rate=1e9),
+        },
+    )
+
+
+def local(quick: bool) -> Iterator[Table]:
+    """Yield the table over loopback."""
     count, seconds = (20, 0.5) if quick else (2000, 5.0)
     with hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=CHANGES) as rig:
-        results = {"one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}}
+        results: dict[str, dict[str, Any]] = {
+            "one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
+        }
     with tempfile.TemporaryDirectory() as keys:
         os.environ["HAL_KEYS"] = keys
         make_key("host", "here", [WITH_TLS])
@@ -97,3 +187,9 @@ def run(quick: bool = False) -> Iterator[Table]:
             results[name] = found
         del os.environ["HAL_KEYS"]
     yield compare(f"From a command to its set-point, servo and commands at {RATE:g} Hz", results)
+
+
+def run(quick: bool = False) -> Iterator[Table]:
+    """Yield the tables."""
+    yield from local(quick)
+    yield from networks(quick)

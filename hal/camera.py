@@ -109,6 +109,11 @@ class Camera:
         """Whether the camera is connected; after a loss, from its next frame on."""
         return self._error is None
 
+    def check(self) -> None:
+        """Raise ConnectionLost while the camera does not answer."""
+        if self._error is not None:
+            raise self._error
+
     def read(self, timeout: float = 1.0, after: float | None = None) -> Frame:
         """Return the next frame that was not returned yet.
 

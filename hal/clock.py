@@ -17,6 +17,8 @@ _LONGEST = 1e9
 """Greatest time of a sleep, s."""
 _BETWEEN = 0.004
 """Least time between two ticks of a loop that an event wakes, s."""
+_STEP = 0.001
+"""Time after which the simulation, which takes whole steps of its own, is looked at for such an event again, s."""
 
 
 class Tick(NamedTuple):
@@ -52,8 +54,8 @@ class Clock(ABC):
 
         Args:
             hz: Rate, Hz.
-            wake: In real time, also yield a tick as soon as this event is set, 4 ms after the last tick at the
-                earliest, and clear it (see :meth:`hal.Gamepad.wake`).
+            wake: Also yield a tick as soon as this event is set, 4 ms after the last tick at the earliest, and clear
+                it (see :meth:`hal.Gamepad.wake`).
 
         Raises:
             CommandError: The rate is not positive, or not finite.
@@ -78,9 +80,9 @@ class Clock(ABC):
                 dt = start + turn * period - now
             self.sleep_until(start + turn * period)
 
+    @abstractmethod
     def _is_woken(self, wake: threading.Event, t: float) -> bool:
         """Wait until the event is set, which clears it, or until the time ``t``; return whether it was set."""
-        return False
 
 
 class RealClock(Clock):
@@ -133,6 +135,14 @@ class LockStepClock(Clock):
                 self._advance_to(stop.due)
                 stop.run(self._now())
             self._advance_to(t)
+
+    def _is_woken(self, wake: threading.Event, t: float) -> bool:
+        self.sleep_until(min(t, self.now() + _BETWEEN))
+        while not wake.is_set() and self.now() < t - _ROUNDING:
+            self.sleep_until(min(t, self.now() + _STEP))
+        woken = wake.is_set() and self.now() < t - _ROUNDING
+        wake.clear()
+        return woken
 
     def call_every(self, seconds: float, call: Callable[[], object]) -> Callable[[], None]:
         """Call a function at regular simulated times, from the thread that waits then.

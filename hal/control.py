@@ -371,6 +371,7 @@ class Control:
             self.robot._commands += 1
             record = CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event)
             self._mail.put_command(record)
+        self._host.wake()
         return command
 
     def hold_until_following(self) -> bool:

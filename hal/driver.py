@@ -527,6 +527,8 @@ class PadReading(NamedTuple):
     """Axes that the pad has not reported yet; their value is 0, and no control counts until they have moved."""
     joints: tuple[float, ...] = ()
     """Joint positions of a leader arm (n,), rad; empty for a gamepad."""
+    pose: tuple[float, ...] = ()
+    """Pose of a hand that is tracked, see :attr:`hal.PadState.pose`; empty for others."""
 
 
 class Plugged(NamedTuple):

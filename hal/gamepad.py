@@ -240,9 +240,10 @@ class Gamepad:
             for held in self._held.values():
                 held.update(reading, gate_open=live)
             last = self._state
-            stamp, joints = Stamp(reading.t, reading.t_device, reading.seq), reading.joints
-            state = PadState(stamp, MappingProxyType(axes), buttons, reading.connected, joints)
-            same = (last.axes, last.buttons, last.connected, last.joints) == (axes, buttons, state.connected, joints)
+            stamp, where = Stamp(reading.t, reading.t_device, reading.seq), (reading.joints, reading.pose)
+            state = PadState(stamp, MappingProxyType(axes), buttons, reading.connected, *where)
+            same = (last.axes, last.buttons, last.connected) == (axes, buttons, state.connected)
+            same = same and (last.joints, last.pose) == where
             if same and last.stamp == state.stamp:
                 return
             self._state = state

@@ -44,7 +44,8 @@ class Gripper:
         self._host = host
         self._latch = host.latch
         self._mail = host.memory.grippers[spec.name]
-        self._commands = 0
+        state = self.peek()
+        self._commands = 0 if state is None else state.target_seq  # one at another computer knows earlier programs
         self._motion: GripperMotion | None = None
         self._sending = threading.RLock()  # a signal handler may call stop() in the middle of a command
 

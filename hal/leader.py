@@ -31,6 +31,8 @@ _RETRY = 0.25
 """Time between two attempts to connect to a leader, s."""
 _STIR, _REST = 0.01, 1.0
 """A leader without any dead-man counts as held from a motion of so many rad on, until it rests for so many s."""
+_HEARD = 0.15
+"""Time for which a leader follows what it was given last, s."""
 _AWAY = PadReading(-math.inf, -math.inf, 0.0, 0, MappingProxyType({}), frozenset(), connected=False)
 
 
@@ -46,7 +48,7 @@ class Angles(NamedTuple):
 
 
 class LeaderDriver(GamepadDriver):
-    """Driver of one leader arm. It never moves a motor, and never writes to one.
+    """Driver of one leader arm. It never moves a motor, and never writes to one, unless it shall follow the arm.
 
     Args:
         spec: Record of the leader, with :attr:`~hal.specs.PadSpec.leader`.
@@ -69,6 +71,22 @@ class LeaderDriver(GamepadDriver):
         self._rested: Sequence[float] = ()
         """Joint positions from which a motion is counted, if moving it is its dead-man."""
         self._t_moved = -math.inf
+        self._wanted: tuple[float, Sequence[float]] | None = None
+        """When it was given joint positions to follow, by the monotonic clock, s, and these, rad."""
+
+    def follow(self, q: Sequence[float] | None) -> None:
+        """Come to these joint positions (n,), rad, if it may move; for 0.15 s, if no others come. Any thread.
+
+        None: let it go, which a person wants to move.
+        """
+        self._wanted = None if q is None else (monotonic(), q)
+
+    @property
+    def wanted(self) -> Sequence[float] | None:
+        """Joint positions to follow at the moment (n,), rad; None for none."""
+        given = self._wanted
+        fresh = given is not None and self.leader.follow > 0.0 and monotonic() - given[0] < _HEARD
+        return given[1] if given is not None and fresh else None
 
     @abstractmethod
     def read_angles(self, now: float) -> Angles:
@@ -113,7 +131,7 @@ class LeaderDriver(GamepadDriver):
 
     def _make_reading(self, angles: Angles) -> PadReading:
         last, leader = self._reading, self.leader
-        q = self._find_joints(angles.q, last.joints)
+        q = self.find_joints(angles.q)
         axes = {"r2": angles.lever} if leader.lever == "gripper" else {}
         if leader.lever == "deadman":
             axes["l2"] = angles.lever
@@ -126,13 +144,13 @@ class LeaderDriver(GamepadDriver):
             t, seq = angles.t, seq + 1
         return PadReading(t, angles.t, t, seq, MappingProxyType(axes), buttons, connected=True, joints=q)
 
-    def _find_joints(self, angles: Sequence[float], last: Sequence[float]) -> tuple[float, ...]:
+    def find_joints(self, angles: Sequence[float]) -> tuple[float, ...]:
         """Return the joint positions, without leaps where a motor begins another turn.
 
         The first ones are in the turn nearest to their usual positions: a motor that counts turns may come back from a
         power cycle shifted by some.
         """
-        found = []
+        found, last = [], self._reading.joints
         for k, angle in enumerate(angles):
             gain = self.leader.gains[k]
             position = gain * (angle - self.leader.offsets[k])

@@ -1,8 +1,8 @@
-"""Following a leader: turns the states of a leader arm into targets for an arm, without a jump when it is engaged."""
+"""Following a leader arm or a hand: turns its states into targets for an arm, without a jump when it is engaged."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,12 @@ from .config.mapping import TeleopMapping
 from .errors import CommandError
 from .geometry import Pose
 from .kinematics.arm import Kinematics
-from .leader import Leader
+from .leader import Leader, LeaderDriver
 from .teleop import Teleop
 from .types import PadState, RobotStatus
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from .commands import Command
@@ -26,21 +27,81 @@ if TYPE_CHECKING:
     from .types import RobotState
 
 Array = NDArray[np.float64]
-_STILL = 1e-3
-"""Speed of every joint's set-point below which the arm counts as at rest, rad/s."""
+_STILL, _SAME = 1e-3, 1e-9
+"""Speed of every joint's set-point below which the arm counts as at rest, rad/s, if the set-point is the same, rad, as
+in the state before: one that turns back is slow for a moment."""
 _REACH = 0.999
 """Share of the arm's reach that a pose may have."""
 STATE_AGE = 2.0
 """Greatest age of a state to start from, s."""
 
 
-class LeaderTeleop(Teleop):
+class HandTeleop(Teleop):
+    """Turns the states of a gamepad into commands, and those of a hand that is tracked, see :attr:`hal.PadState.pose`.
+
+    While it is engaged, the arm follows what the hand moves from the moment of engaging on, so that engaging never
+    moves the arm. It is engaged while the dead-man is held, from when the arm follows commands and its set-point is at
+    rest. The tcp moves along the axes of its base, by :attr:`speed` m for each m of the hand's, and turns as the hand
+    does.
+
+    Args:
+        robot: The arm.
+        mapping: Name or path of a mapping.
+        speed: Share of the mapping's speeds and of the hand's way, above 0, at most 1.
+
+    Raises:
+        ConfigError: The mapping is wrong.
+        CommandError: The speed is out of range.
+    """
+
+    def __init__(self, robot: Robot, mapping: str | Path | TeleopMapping = "default", speed: float = 1.0) -> None:
+        super().__init__(robot, mapping, speed)
+        self.button = self.mapping.deadman
+        """Button that engages it."""
+        self._anchor: _Anchor | None = None
+        self._before: RobotState | None = None
+        """State of the turn before, while it is about to engage."""
+
+    def reset(self) -> None:
+        """Disengage: the arm stays where it is until it follows commands and is at rest, and the button is pressed."""
+        super().reset()
+        self._anchor = self._before = None
+
+    def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
+        """Return the command for a state of the pad: where it has a pose, as :meth:`LeaderTeleop.command`."""
+        if pad.pose:
+            return self._follow(pad.pose, pad, dt)
+        self._anchor = self._before = None
+        return self.step(pad, dt)
+
+    def _follow(self, where: tuple[float, ...], pad: PadState, dt: float) -> tuple[Command, float | None]:
+        """Return the command for a hand or a leader that is there, and the grip."""
+        grip = self._grip(pad)
+        state = self.robot.state(STATE_AGE)
+        if not (where and pad.pressed(self.button) and state.status is RobotStatus.FOLLOWING):
+            self._anchor = self._before = None
+        elif self._anchor is None and self._rests(state):
+            self._anchor = self._make_anchor(where, state)
+        if self._anchor is None:
+            return JointVelocity(np.zeros(self.robot.n)), grip
+        return self._anchor.follow(np.array(where), dt), grip
+
+    def _rests(self, state: RobotState) -> bool:
+        """Return whether the set-point is at rest, by this state and the newest one before it."""
+        before, self._before = self._before, state
+        if before is None or state.stamp.t <= before.stamp.t:
+            return False
+        return bool(np.abs(state.dq_set).max() < _STILL and np.abs(state.q_set - before.q_set).max() < _SAME)
+
+    def _make_anchor(self, where: tuple[float, ...], state: RobotState) -> _Anchor:
+        return _PoseAnchor(self.robot, _hand_pose, self.speed, np.array(where), state.tcp_set)
+
+
+class LeaderTeleop(HandTeleop):
     """Turns the states of a leader into commands.
 
-    While it is engaged, the arm follows what the leader moves from the moment of engaging on, so that engaging never
-    moves the arm. It is engaged while a button is pressed, from when the arm follows commands and its set-point is at
-    rest. An arm of the leader's own kind follows joint to joint, any other one by the pose of the leader's tcp: along
-    the axes of both bases.
+    It is engaged as :class:`HandTeleop`, and the arm follows what the leader moves from then on. An arm of the leader's
+    own kind follows joint to joint, any other one by the pose of the leader's tcp: along the axes of both bases.
 
     Args:
         robot: The arm.
@@ -58,8 +119,7 @@ class LeaderTeleop(Teleop):
     ) -> None:
         super().__init__(robot, mapping, speed)
         self.leader, self.spec = leader, leader.spec
-        self.button = self.mapping.deadman
-        """Button that engages it."""
+        self._driver = cast(LeaderDriver, leader.driver)
         self._kinematics: Kinematics | None = None
         if robot.spec.model not in self.spec.leads:
             if self.spec.kinematics is None:
@@ -69,12 +129,6 @@ class LeaderTeleop(Teleop):
         elif len(self.spec.joints) != robot.n:
             message = f"{leader.name} has {len(self.spec.joints)} joints, {robot.name} {robot.n}"
             raise CommandError(message, code="cannot_lead")
-        self._anchor: _Anchor | None = None
-
-    def reset(self) -> None:
-        """Disengage: the arm stays where it is until it follows commands and is at rest, and the button is pressed."""
-        super().reset()
-        self._anchor = None
 
     def prepare_takeover(self) -> None:
         """Engage by the mapping's ``take_over`` instead of the dead-man. Raises CommandError if there is none."""
@@ -85,6 +139,11 @@ class LeaderTeleop(Teleop):
     def is_touched(self, pad: PadState) -> bool:
         """Return whether the button that engages it is pressed."""
         return pad.pressed(self.button)
+
+    def watch(self) -> None:
+        """Let a leader that may move follow an arm that it leads joint to joint."""
+        if self._kinematics is None and self.spec.follow > 0.0:
+            self._driver.follow(self.robot.state(STATE_AGE).q_set.tolist())
 
     def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
         """Return the command for a state of the leader.
@@ -101,21 +160,15 @@ class LeaderTeleop(Teleop):
             StaleStateError: The arm's state is too old.
             ConnectionLost: The arm does not answer.
         """
-        grip = self._grip(pad)
-        state = self.robot.state(STATE_AGE)
-        if not (pad.joints and pad.pressed(self.button) and state.status is RobotStatus.FOLLOWING):
-            self._anchor = None
-        elif self._anchor is None and np.abs(state.dq_set).max() < _STILL:
-            self._anchor = self._make_anchor(pad.joints, state)
-        if self._anchor is None:
-            return JointVelocity(np.zeros(self.robot.n)), grip
-        return self._anchor.follow(np.array(pad.joints), dt), grip
+        self._driver.follow(None)
+        return self._follow(pad.joints, pad, dt)
 
-    def _make_anchor(self, joints: tuple[float, ...], state: RobotState) -> _Anchor:
+    def _make_anchor(self, where: tuple[float, ...], state: RobotState) -> _Anchor:
+        joints = np.array(where)
         if self._kinematics is not None:
-            return _PoseAnchor(self.robot, self._kinematics, self.spec.pose_scale, np.array(joints), state.tcp_set)
+            return _PoseAnchor(self.robot, self._kinematics.pose, self.spec.pose_scale, joints, state.tcp_set)
         speed = self.speed * self.robot.spec.move_speed if self.spec.engage == "approach" else 0.0
-        return _JointAnchor(np.array(joints), state.q_set, speed * np.array(self.robot.limits.velocity))
+        return _JointAnchor(joints, state.q_set, speed * np.array(self.robot.limits.velocity))
 
     def help(self, pad: Gamepad) -> list[str]:
         """Return how the arm follows, and what the controls do, in lines of text."""
@@ -146,29 +199,33 @@ class _JointAnchor:
 
 
 class _PoseAnchor:
-    """Where the tcps of leader and arm were when they engaged.
+    """Where the tcp of the leader, or the hand, and the arm were when they engaged.
 
     Args:
         robot: The arm.
-        kinematics: That of the leader.
+        pose_of: Returns the pose of the leader for its joint positions.
         scale: Way of the arm's tcp for each m of the leader's.
         joints: Joint positions of the leader (n,), rad.
         tcp: Pose of the arm's set-point.
     """
 
-    def __init__(self, robot: Robot, kinematics: Kinematics, scale: float, joints: Array, tcp: Pose) -> None:
-        self._kinematics, self._scale, self._tcp = kinematics, scale, tcp
-        self._leader = kinematics.pose(joints)
+    def __init__(self, robot: Robot, pose_of: Callable[[Array], Pose], scale: float, joints: Array, tcp: Pose) -> None:
+        self._pose_of, self._scale, self._tcp = pose_of, scale, tcp
+        self._leader = pose_of(joints)
         self._back = Pose((0.0, 0.0, 0.0), self._leader.orientation).inverse()
         self._farthest = _REACH * robot.kinematics.farthest()
 
     def follow(self, joints: Array, dt: float) -> CartesianTarget:
         """Return the target for the present joint positions of the leader (n,), rad."""
-        here = self._kinematics.pose(joints)
+        here = self._pose_of(joints)
         position = self._tcp.position + self._scale * (here.position - self._leader.position)
         position *= min(1.0, self._farthest / max(float(np.linalg.norm(position)), 1e-9))
         turned = Pose((0.0, 0.0, 0.0), here.orientation) @ self._back
         return CartesianTarget(Pose(position, (turned @ self._tcp).orientation))
+
+
+def _hand_pose(where: Array) -> Pose:
+    return Pose(where[:3], where[3:])
 
 
 _Anchor: TypeAlias = _JointAnchor | _PoseAnchor
@@ -176,7 +233,7 @@ _Anchor: TypeAlias = _JointAnchor | _PoseAnchor
 
 def make_teleop(robot: Robot, pad: Gamepad, mapping: str | Path | TeleopMapping, speed: float = 1.0) -> Teleop:
     """Return what turns the states of a gamepad, or of a leader, into commands for an arm."""
-    return LeaderTeleop(robot, pad, mapping, speed) if isinstance(pad, Leader) else Teleop(robot, mapping, speed)
+    return LeaderTeleop(robot, pad, mapping, speed) if isinstance(pad, Leader) else HandTeleop(robot, mapping, speed)
 
 
 def explain_leads(spec: LeaderSpec) -> str:

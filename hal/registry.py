@@ -45,6 +45,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "pybullet": "hal.drivers.pybullet:DRIVER",
         "realsense": "hal.drivers.realsense:DRIVER",
         "robotiq": "hal.drivers.robotiq:DRIVER",
+        "served": "hal.drivers.served:DRIVER",
         "terminal": "hal.drivers.terminal:DRIVER",
         "ur": "hal.drivers.ur:DRIVER",
         "v4l2": "hal.drivers.webcam:V4L2",
@@ -62,6 +63,10 @@ with a :attr:`~DriverSpec.world` is an engine, too."""
 
 SIMULATION = "simulation"
 """Stands in ``drivers: {sim: simulation}`` for the engine of the rig."""
+
+
+SERVED = "served"
+"""The driver of cameras of another computer."""
 
 
 @dataclass(frozen=True)

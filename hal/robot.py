@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -69,7 +70,8 @@ class Robot:
         self._host = host
         self._mail = host.memory.robots[spec.name]
         self._latch = host.latch
-        self._sessions = 0
+        # A host at another computer has had sessions of other programs, and has the last command of one.
+        self._sessions = 0 if spec.at is None else random.getrandbits(32)
         self._commands = 0
         self._open: Control | None = None
         self._motion: ArmMotion | None = None

@@ -335,6 +335,8 @@ class CameraSpec:
     """Camera matrix of both infrared images of a frame; None if they have the view of ``K``."""
     depth_sensor: DepthSensorSpec | None = None
     """None if the model has none."""
+    at: str | None = None
+    """Address of the computer that serves this camera; None if it is at this one."""
 
     @property
     def reference(self) -> str:
@@ -369,6 +371,8 @@ class LeaderSpec:
     """What its lever is: ``gripper``, ``deadman`` or ``none``."""
     deadman: str | None
     """Gamepad of the rig that must be held; None for the lever, or for no dead-man at all."""
+    follow: float = 0.0
+    """Share of its motors' torque with which it follows the arm while a policy drives it; 0: it never does."""
     emulated: bool = False
 
     @property

@@ -107,6 +107,9 @@ class Teleop:
             return pad.axis(gripper.axis) > _PRESSED
         return any(pad.pressed(button) for button in (gripper.open, gripper.close, gripper.toggle) if button)
 
+    def watch(self) -> None:
+        """Note that a policy drives the arm in this turn."""
+
     def step(self, pad: PadState, dt: float) -> tuple[Twist, float | None]:
         """Return the command for a pad's state.
 
@@ -412,12 +415,12 @@ class ArmTeleop:
         self.load_mapping()
 
     def follow_gizmo(self, motion: Command, view: Viewer3D | None) -> Command:
-        """Return the velocity towards the gizmo of the 3D view if it was dragged; moving a stick resets the gizmo."""
+        """Return the velocity towards the gizmo of the 3D view if it was dragged; a stick, or a release, resets it."""
         name = self.robot.name
         goal = view.goal(name) if view is not None else None
         if view is None or goal is None or not isinstance(motion, Twist):
             return motion
-        if motion.linear.any() or motion.angular.any() or self.held_for:
+        if motion.linear.any() or motion.angular.any() or self.held_for or not self.deadman.held:
             view.clear_goal(name)
             return motion
         linear, angular = self.teleop.mapping.speeds()

@@ -387,6 +387,9 @@ class PadState:
     connected: bool = False
     joints: tuple[float, ...] = ()
     """Joint positions of a leader arm (n,), rad; empty for a gamepad, and while it is not connected."""
+    pose: tuple[float, ...] = ()
+    """Position (m) and orientation (x, y, z, w) of a tracked hand that holds the dead-man, (7,): x is forward, y left,
+    z up for the person; the origin is anywhere. Empty without one."""
 
     def axis(self, name: str) -> float:
         """Return the value of an axis; 0 if this pad does not have it. KeyError for a name not in :data:`AXES`."""

@@ -50,6 +50,8 @@ class Console(ABC):
         self.rig = rig
         self.listen = listen
         self.driven_by = driven_by
+        self.driver: str | None = None
+        """Name of the page in control, for example ``page 3``; None if there is none."""
 
     @abstractmethod
     def wait_ready(self) -> None:

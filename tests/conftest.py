@@ -41,8 +41,6 @@ FAST = {
     "lock_step": "whole rigs in simulation, in lock-step",
     "loops": "what a user does, from beginning to end: each row of the tables of docs/safety.md",
 }
-WITHOUT_FAST = ("not (fast", "pair", "browser or alone")
-"""How the expressions after -m of ``.ci/run`` begin that take no test of the fast tier."""
 OTHERS = {
     "wire": "drivers against emulated devices, through the vendors' client libraries",
     "system": "whole rigs in real time: processes, and faults at run time",
@@ -55,9 +53,19 @@ MARKERS = {
     "all": "every test: 'pytest -m all' runs everything",
     "fast": "tests of the fast tier (unit, contract, lock_step and loops, without the slow ones): what 'pytest' runs",
     "slow": "takes more than a few seconds; never in the fast tier",
-    "alone": "drives in real time what a busy computer would stop: CI runs nothing beside it, as with all of 'browser'",
-    "pair": "drives in real time, and may share two processors with one other: CI runs two at once",
+    "alone": "drives in real time what a busy computer would stop: CI runs nothing beside it",
+    "pair": "drives in real time, and may share two processors with one other: CI runs two at once, as of 'browser'",
+    "background": "needs no real time: CI runs it at idle priority beside 'pair' and 'browser'; all of BACKGROUND",
 }
+BACKGROUND = ("unit", "lock_step", "docs", "packaging")
+"""Folders whose tests, as far as they are not of the fast tier, are marked ``background``."""
+COLLECTED: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "not (fast": (tuple(name for name in OTHERS if name not in BACKGROUND), ("slow",)),
+    "background": (("docs", "packaging"), ("slow", "background")),
+    "pair": (("browser",), ("pair",)),
+    "alone": ((), ("alone",)),
+}
+"""How an expression after -m of ``.ci/run`` begins -> folders that it takes, and markers of its tests in other ones."""
 
 
 collect_ignore = ["engine_package", *([] if "HAL_TEST_LEROBOT" in os.environ else ["system/test_lerobot_tools.py"])]
@@ -121,13 +129,13 @@ def pytest_report_header(config: pytest.Config) -> str | None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Without -m, or with -m fast, do not even import what is outside the fast tier; with CI's other -m the reverse.
-
-    To collect the 5,600 tests of the fast tier takes each worker 16 s.
-    """
-    if config.option.markexpr.startswith(WITHOUT_FAST) and _tier(collection_path) in FAST:
-        text = collection_path.read_text(encoding="utf-8") if collection_path.suffix == ".py" else "slow"
-        return None if any(mark in text for mark in ("slow", "alone", "pair")) else True
+    """Without -m, or with -m fast, do not even import what is outside the fast tier; with CI's other -m the reverse."""
+    tier = _tier(collection_path)
+    for begin, (folders, marks) in COLLECTED.items():
+        if config.option.markexpr.startswith(begin) and tier and collection_path.name.startswith("test_"):
+            text = "" if tier in folders else collection_path.read_text(encoding="utf-8")
+            taken = tier in folders or any(f"mark.{mark}" in text for mark in marks)
+            return None if taken and not (begin == "not (fast" and tier in BACKGROUND) else True
     if config.option.markexpr not in ("", "fast") or _tier(collection_path) not in OTHERS:
         return None
     return None if _touches(collection_path, _named(config)) else True
@@ -141,7 +149,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         tier = _tier(item.path)
         slow = item.get_closest_marker("slow") is not None
-        for name in ["all", *([tier] if tier else []), *(["fast"] if tier in FAST and not slow else [])]:
+        fast = tier in FAST and not slow
+        timed = any(item.get_closest_marker(name) for name in ("pair", "alone"))
+        kinds = {"fast": fast, "background": tier in BACKGROUND and not fast and not timed}
+        for name in ["all", *([tier] if tier else []), *(name for name, of_it in kinds.items() if of_it)]:
             item.add_marker(name)
         (left if slow and not config.option.markexpr and not _touches(item.path, named) else kept).append(item)
     if left:

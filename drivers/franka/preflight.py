@@ -52,7 +52,7 @@ _GOOD, _BUDGET = 0.3e-3, 1e-3
 """Round-trip times, s. According to Franka's documentation a whole cycle, with the computing time of both sides, has
 to fit into 1 ms; the share of 0.3 ms for the network is our choice."""
 _ALLOW_PING = "sudo sysctl -w net.ipv4.ping_group_range='0 2147483647'"
-"""Allows every user to ping without the program."""
+"""Allows every user to ping."""
 _IMPROVE = "connect the cable directly to Control's LAN port, end busy programs, and use a real-time kernel"
 
 

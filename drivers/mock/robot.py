@@ -109,7 +109,7 @@ class MockRobot(MockDevice[MockRobotFaults], RobotDriver):
         dq = tuple(self._follows.dq) if moved else (0.0,) * n
         if faults.garbage == "short":
             q, dq = q[:-1], dq[:-1]
-        fault = None if faults.fault is None else Fault("mock", faults.fault, "call recover() on the arm")
+        fault = None if faults.fault is None else Fault("mock", faults.fault, "nothing to repair: a simulated fault")
         reading = Reading(
             t,
             t_device,

@@ -16,12 +16,12 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, cast
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hal.config.files import check_record
 from hal.driver import GamepadDriver, PadReading
@@ -85,7 +85,7 @@ class PlaybackPad(GamepadDriver):
         self._last: PadReading | None = None
 
     def open(self) -> None:
-        """Read the recording. Raises ConfigError, which lists every bad line."""
+        """Read the recording. Raises ConfigError, which names the first bad line."""
         self._recording = load_recording(self._options.file)
         self._mapper = PadMapper(self._find_model(), self._recording.ranges)
         self.flat, self.absolute = self._mapper.flat, self._mapper.model.absolute
@@ -210,7 +210,6 @@ def check(spec: PadSpec) -> Iterator[tuple[str, str, str]]:
 
 # The file format.
 
-_FORMAT, _VERSION = "hal-pad-events", 1
 _EVENT_TYPES = {"abs": (EV_ABS, ABS), "key": (EV_KEY, KEY)}
 
 
@@ -242,7 +241,7 @@ class PadRecording(NamedTuple):
 
 def dump_recording(recording: PadRecording) -> str:
     """Return the text of a recording's file."""
-    header: dict[str, Any] = {"format": _FORMAT, "version": _VERSION, "model": recording.model}
+    header: dict[str, Any] = {"format": "hal-pad-events", "version": 1, "model": recording.model}
     header["ranges"] = {ABS_NAME[code]: [*span] for code, span in recording.ranges.items()}
     if recording.about:
         header["about"] = recording.about
@@ -253,105 +252,75 @@ def dump_recording(recording: PadRecording) -> str:
     return "\n".join(lines) + "\n"
 
 
+class _Header(BaseModel):
+    """The first line of a file."""
+
+    model_config = ConfigDict(strict=True)
+
+    format: Literal["hal-pad-events"]
+    version: Literal[1]
+    model: str | dict[str, Any]
+    ranges: dict[str, Annotated[list[int], Field(min_length=2, max_length=3)]]
+    about: str = ""
+
+
+class _Event(BaseModel):
+    """A further line."""
+
+    model_config = ConfigDict(strict=True)
+
+    t: Seconds
+    type: Literal["abs", "key"]
+    code: str
+    value: int
+
+
 def load_recording(path: Path) -> PadRecording:
     """Read a recording.
 
     Raises:
-        ConfigError: The file cannot be read, or lines of it are wrong; lists every bad line with its number.
+        ConfigError: The file cannot be read, or a line of it is wrong; names the first one.
     """
+    number = 1
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError([Problem(str(path), "", f"cannot be read: {error.strerror}", code="unreadable")]) from None
-    except UnicodeDecodeError:
-        message = "is not a text file; a pad's recording is JSON lines"
-        raise ConfigError([Problem(str(path), "", message, code="unreadable")]) from None
-    parser = _RecordingParser(str(path))
-    recording = parser.parse(text.splitlines())
-    if parser.problems:
-        raise ConfigError(parser.problems)
-    return recording
+        lines = [(k, line) for k, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1) if line.strip()]
+        header = _Header.model_validate_json(lines[0][1] if lines else "")
+        ranges = {_find_code("abs", name): _read_range(name, span) for name, span in header.ranges.items()}
+        events: list[RecordedEvent] = []
+        for number, line in lines[1:]:  # noqa: B007  # an error names it
+            events.append(_read_event(line, ranges, events[-1].t if events else 0.0))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError([Problem(str(path), "", f"cannot be read: {error}", code="unreadable")]) from None
+    except ValueError as error:
+        raise ConfigError([Problem(str(path), f"line {number}", _explain(error), "bad_recording")]) from None
+    return PadRecording(header.model, ranges, events, header.about)
 
 
-class _RecordingParser:
-    """Parses the lines of a file, and collects every problem instead of stopping at the first."""
+def _read_event(line: str, ranges: Mapping[int, AxisRange], latest: float) -> RecordedEvent:
+    event = _Event.model_validate_json(line)
+    code = _find_code(event.type, event.code)
+    if event.t < latest:
+        raise ValueError(f"goes back in time, from {latest:g} s to {event.t:g} s")
+    if event.type == "abs" and ranges and code not in ranges:
+        raise ValueError(f"{event.code} has no range in the header")
+    return RecordedEvent(event.t, _EVENT_TYPES[event.type][0], code, event.value)
 
-    def __init__(self, file: str) -> None:
-        self.file = file
-        self.problems: list[Problem] = []
 
-    def _add_problem(self, line: int, message: str) -> None:
-        self.problems.append(Problem(self.file, f"line {line}", message, "bad_recording"))
+def _find_code(kind: str, name: str) -> int:
+    codes = _EVENT_TYPES[kind][1]
+    if name not in codes:
+        raise ValueError(f"{name!r} is not an event code of type {kind}")
+    return codes[name]
 
-    def parse(self, lines: Sequence[str]) -> PadRecording:
-        objects = [
-            (number, found)
-            for number, line in enumerate(lines, 1)
-            if line.strip() and (found := self._object(number, line)) is not None
-        ]
-        if not objects:
-            if not self.problems:
-                self._add_problem(1, "the file is empty; its first line is a header")
-            return PadRecording("", {}, ())
-        if objects[0][0] != 1 and any(problem.key == "line 1" for problem in self.problems):
-            return PadRecording("", {}, ())  # the header itself does not parse: what follows has no meaning
-        model, ranges, about = self._header(*objects[0])
-        return PadRecording(model, ranges, tuple(self._events(objects[1:], ranges)), about)
 
-    def _object(self, number: int, line: str) -> dict[str, Any] | None:
-        try:
-            found = json.loads(line)
-        except json.JSONDecodeError as error:
-            self._add_problem(number, f"is not JSON: {error.msg} at column {error.colno}")
-            return None
-        if not isinstance(found, dict):
-            self._add_problem(number, "must be an object in braces")
-            return None
-        return found
+def _read_range(name: str, span: Sequence[int]) -> AxisRange:
+    if span[0] >= span[1]:
+        raise ValueError(f"ranges: {name} must be [minimum, maximum] or [minimum, maximum, flat]")
+    return AxisRange(*span)
 
-    def _header(self, number: int, header: dict[str, Any]) -> tuple[str | dict[str, Any], dict[int, AxisRange], str]:
-        if header.get("format") != _FORMAT:
-            self._add_problem(number, f'the first line must be a header with "format": "{_FORMAT}"')
-        elif header.get("version") != _VERSION:
-            self._add_problem(number, f"unknown version {header.get('version')!r}; the present one is {_VERSION}")
-        model = header.get("model")
-        if not isinstance(model, (str, dict)):
-            self._add_problem(number, '"model" must be the name of a pad model, or a model')
-            model = ""
-        ranges: dict[int, AxisRange] = {}
-        given = header.get("ranges")
-        for name, span in given.items() if isinstance(given, dict) else ():
-            whole = isinstance(span, list) and len(span) in (2, 3) and all(type(item) is int for item in span)
-            if name not in ABS:
-                self._add_problem(number, f"ranges: {name!r} is not an event code of an axis")
-            elif not whole or span[0] >= span[1]:
-                self._add_problem(number, f"ranges: {name} must be [minimum, maximum] or [minimum, maximum, flat]")
-            else:
-                ranges[ABS[name]] = AxisRange(*span)
-        if not isinstance(given, dict):
-            self._add_problem(number, '"ranges" must give the range of each axis: {"ABS_X": [0, 255], ...}')
-        return model, ranges, str(header.get("about", ""))
 
-    def _events(
-        self, objects: Iterable[tuple[int, dict[str, Any]]], ranges: Mapping[int, AxisRange]
-    ) -> Iterator[RecordedEvent]:
-        latest = 0.0
-        for number, found in objects:
-            t, value = found.get("t"), found.get("value")
-            kind, name = str(found.get("type")), str(found.get("code"))
-            if not isinstance(t, (int, float)) or isinstance(t, bool) or not math.isfinite(t) or t < 0.0:
-                self._add_problem(number, f'"t" must be seconds from the start, not {t!r}')
-            elif kind not in _EVENT_TYPES:
-                self._add_problem(number, f'"type" must be "abs" or "key", not {kind!r}')
-            elif name not in _EVENT_TYPES[kind][1]:
-                self._add_problem(number, f'"code" {name!r} is not an event code of type {kind}')
-            elif type(value) is not int:
-                self._add_problem(number, f'"value" must be a whole number, not {value!r}')
-            elif t < latest:
-                self._add_problem(number, f"goes back in time, from {latest:g} s to {t:g} s")
-            elif kind == "abs" and ranges and ABS[name] not in ranges:
-                self._add_problem(number, f"{name} has no range in the header")
-            else:
-                latest = t
-                event_type, codes = _EVENT_TYPES[kind]
-                yield RecordedEvent(float(t), event_type, codes[name], value)
+def _explain(error: ValueError) -> str:
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors(include_url=False, include_input=False)[0]
+    return ": ".join([*map(str, first["loc"]), first["msg"]])

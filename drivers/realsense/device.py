@@ -7,9 +7,7 @@ Runs in the process of :mod:`.process`, and is the only part that touches librea
 from __future__ import annotations
 
 import gc
-import hashlib
 import os
-import socket
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -30,9 +28,6 @@ _FIRST_SET = 3.0
 """s that a camera may take to send its first frame set after a start."""
 _RESTART_WARM_UP = 0.3
 """s of warm-up where the camera was open before: its exposure was settled a moment ago."""
-_SOCKET_NAMES = "/proc/net/unix"
-_LONGEST = 48
-"""Characters of a camera's name that fit into a socket's name."""
 
 
 class RealSenseDevice:
@@ -57,7 +52,7 @@ class RealSenseDevice:
         self._lock: DeviceLock | None = None
         self._recordings: RecordingFiles | None = None
         if self._settings.record is not None:
-            self._recordings = RecordingFiles(self._settings.record, spec.name, self._settings.overwrite)
+            self._recordings = RecordingFiles(self._settings.record, self._settings.overwrite)
         self._pipeline: FramePipeline | None = None
         self._streamer: FrameStreamer | None = None
         self._played = ""
@@ -319,18 +314,16 @@ class RecordingFiles:
     one file would otherwise delete each other's recording.
     """
 
-    def __init__(self, path: str, camera: str, overwrite: bool) -> None:
+    def __init__(self, path: str, overwrite: bool) -> None:
         """Create the list of files; nothing is written.
 
         Args:
             path: The file of the first recording.
-            camera: Name of the camera, for the error of another camera that records to the same file.
             overwrite: Whether that file may exist already, and is then deleted.
         """
         self._path = Path(path)
-        self._camera = camera
         self._overwrite = overwrite
-        self._locks: dict[Path, _FileLock] = {}
+        self._locks: dict[Path, DeviceLock] = {}
 
     def next_file(self, first: bool) -> str:
         """Lock and return the file for a new recording.
@@ -359,41 +352,14 @@ class RecordingFiles:
 
     def _acquire(self, path: Path) -> None:
         if path not in self._locks:
-            self._locks[path] = _FileLock(path, self._camera)
+            try:
+                self._locks[path] = DeviceLock(f"recording-{os.path.realpath(path)}", str(path))
+            except ControlTaken as error:
+                text = f"{error}: another camera records to it, use two files"
+                raise ControlTaken(text, code="recording_in_use") from None
 
     def close(self) -> None:
         """Release all files. Idempotent."""
         for lock in self._locks.values():
             lock.release()
         self._locks.clear()
-
-
-class _FileLock:
-    """A lock on one file, and a socket whose name contains the name of the camera that records to it."""
-
-    def __init__(self, path: Path, camera: str) -> None:
-        """Acquire the lock; raises ControlTaken, which names both cameras."""
-        key = "recording-" + hashlib.sha256(os.path.realpath(path).encode()).hexdigest()[:32]
-        try:
-            self._lock = DeviceLock(key, str(path))
-        except ControlTaken:
-            text = f"camera {camera} is to record to {path}, which {_find_writer(key)} records to: use two files"
-            raise ControlTaken(text, code="recording_in_use") from None
-        self._name = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        with suppress(OSError):  # it only serves the error's text
-            self._name.bind(f"\0hal-{key}-{camera[:_LONGEST]}")
-
-    def release(self) -> None:
-        self._name.close()
-        self._lock.release()
-
-
-def _find_writer(key: str) -> str:
-    """Return the name of the camera that holds a file's lock."""
-    mark = f"@hal-{key}-"
-    with suppress(OSError), open(_SOCKET_NAMES, encoding="utf-8", errors="replace") as names:
-        for line in names:
-            _, found, camera = line.rstrip("\n").partition(mark)
-            if found:
-                return f"camera {camera}"
-    return "another camera"

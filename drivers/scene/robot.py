@@ -210,7 +210,7 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         if "fault" not in faults:
             return
         cause = faults["fault"]
-        self._fault = Fault("injected", str(cause), "call recover() on the arm") if cause else None
+        self._fault = Fault("injected", str(cause), "nothing to repair: a simulated fault") if cause else None
         if self._fault is not None and self._open:
             self._hold(self._positions())
 

@@ -8,9 +8,9 @@ from hal.registry import DriverSpec
 
 FEETECH = DriverSpec(
     name="feetech",
-    robot="hal.drivers.servo_bus.arm:FeetechArm",
-    gripper="hal.drivers.servo_bus.gripper:FeetechGripper",
-    leader="hal.drivers.servo_bus.leader:FeetechLeader",
+    robot="hal.drivers.servo_bus.arm:ServoArm",
+    gripper="hal.drivers.servo_bus.gripper:ServoGripper",
+    leader="hal.drivers.servo_bus.leader:ServoLeader",
     checks={
         "robot": "hal.drivers.servo_bus.settings:check_arm",
         "gripper": "hal.drivers.servo_bus.settings:check_gripper",
@@ -26,10 +26,4 @@ FEETECH = DriverSpec(
     payload=True,
 )
 
-DYNAMIXEL = replace(
-    FEETECH,
-    name="dynamixel",
-    robot="hal.drivers.servo_bus.arm:DynamixelArm",
-    gripper="hal.drivers.servo_bus.gripper:DynamixelGripper",
-    leader="hal.drivers.servo_bus.leader:DynamixelLeader",
-)
+DYNAMIXEL = replace(FEETECH, name="dynamixel")

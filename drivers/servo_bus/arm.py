@@ -26,10 +26,8 @@ from hal.kinematics.urdf import read_urdf
 from hal.specs import RobotSpec
 
 from .chain import Chain, Joint
-from .dynamixel import Dynamixel
-from .feetech import Feetech
-from .protocol import COUNT, MotorState, ServoProtocol
-from .settings import ServoArmSettings
+from .protocol import COUNT, MotorState
+from .settings import PROTOCOLS, ServoArmSettings
 
 _ENGAGE = 0.8
 """Time in which all motors must be on, s."""
@@ -56,12 +54,12 @@ _SENT = 8
 class ServoArm(RobotDriver):
     """An arm on a servo bus (settings: :class:`~.settings.ServoArmSettings`)."""
 
-    protocol: ClassVar[ServoProtocol]
     modes: ClassVar[frozenset[str]] = frozenset({"position"})
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
         self.settings = ServoArmSettings.of(spec)
+        self.protocol = PROTOCOLS[spec.driver]()
         self.engaged = False
         urdf = read_urdf(Path(spec.urdf), meshes=False).joints
         joints = [
@@ -251,7 +249,7 @@ class ServoArm(RobotDriver):
         if (not on and self._t_on < inf) or (self._t_on == inf and [state.goal for state in states] != self._goals):
             self._prepare(states)  # also motors that went off meanwhile: their goals may be any
         elif not on:
-            self.chain.switch_on()
+            self.chain.switch(True)
         else:
             self._t_on = min(self._t_on, self._now)
             since = self._now - self._t_on
@@ -330,15 +328,3 @@ class ServoArm(RobotDriver):
             "voltages": [state.voltage for state in states],
             "loads": [round(state.load / self.protocol.full, 3) for state in states],
         }
-
-
-class FeetechArm(ServoArm):
-    """An arm with Feetech servos."""
-
-    protocol = Feetech()
-
-
-class DynamixelArm(ServoArm):
-    """An arm with Dynamixel servos."""
-
-    protocol = Dynamixel()

@@ -10,6 +10,7 @@ import select
 import termios
 import threading
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -18,13 +19,25 @@ from hal.lock import DeviceLock
 from hal.serial_line import explain, open_line, read_line, set_baud
 
 from .protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer, Block, MotorState, ServoProtocol
+from .settings import ANSWER
 
-_ANSWER, _OPENING = 0.008, 0.02
+_ANSWER, _OPENING = ANSWER, 0.02
 """Longest time to wait for answers in a cycle of 100 Hz, and while a device is opened, s."""
 _PATIENCE = 2.0
 """Longest time to wait for another program to release the port, s."""
 _RETRY = 0.25
 """Time between two tries to open a lost port, s."""
+_ADAPTERS = Path("/sys/bus/usb-serial/devices")
+"""Where Linux keeps what it knows about serial adapters."""
+
+
+def find_latency(port: str) -> tuple[int, str]:
+    """Return for how long an FTDI adapter collects answers, ms, and how to end that; 0 for another one."""
+    timer = _ADAPTERS / Path(port).resolve().name / "latency_timer"
+    try:
+        return int(timer.read_text()), f"echo 1 | sudo tee {timer}"
+    except (OSError, ValueError):
+        return 0, ""
 
 
 class ServoBus:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, Problem, RobotFault
 
-from .bus import ServoBus
+from .bus import ServoBus, find_latency
 from .protocol import COUNT, PING, TURN, Calibration, MotorState, Registers, ServoProtocol
 from .settings import ServoSettings
 
@@ -53,6 +53,7 @@ class Chain:
 
     Attributes:
         registers: What the first motor of each joint has stored.
+        stored: What each motor has stored, by id.
         labels: The joints in words.
         motors: The motors in words, by id.
     """
@@ -69,7 +70,7 @@ class Chain:
         ]
         self.ids = tuple(self.motors)
         self.bus: ServoBus | None = None
-        self._stored: dict[int, Registers] = {}
+        self.stored: dict[int, Registers] = {}
         self.lost: ConnectionLost | None = None
         self._opened, self._t_identified = 0, -inf
         self._t_heard: dict[int, float] = {}
@@ -78,7 +79,7 @@ class Chain:
 
     @property
     def registers(self) -> list[Registers]:
-        return [self._stored[joint.ids[0]] for joint in self.joints]
+        return [self.stored[joint.ids[0]] for joint in self.joints]
 
     def open(self) -> None:
         """Open the bus, and check every motor. Nothing moves, and nothing is written.
@@ -119,12 +120,12 @@ class Chain:
         unread = [self.motors[id] for id, block in blocks.items() if block is None]
         if unread:
             raise DeviceNotFound(f"{self.name}: {', '.join(unread)} answers no question; check its cable")
-        self._stored = {id: self.protocol.decode_registers(block) for id, block in blocks.items() if block is not None}
+        self.stored = {id: self.protocol.decode_registers(block) for id, block in blocks.items() if block is not None}
         problems = [
             Problem("<rig>", f"{self.name}.real", f"{self.motors[id]}: {message}", code)
             for joint in self.joints
             for id in joint.ids
-            for message, code in self._check_registers(id, joint, self._stored[id])
+            for message, code in self._check_registers(id, joint, self.stored[id])
         ]
         if problems:
             raise ConfigError(problems)
@@ -210,7 +211,7 @@ class Chain:
             self.lost = self._silence(bus, silent)
             raise self.lost
         self.lost = None
-        found = {id: self._count_turns(states[id], self._stored[id], id) for id in self.ids}
+        found = {id: self._count_turns(states[id], self.stored[id], id) for id in self.ids}
         return [_merge([found[id] for id in joint.ids]) for joint in self.joints]
 
     def _count_turns(self, state: MotorState, stored: Registers, id: int) -> MotorState:
@@ -234,10 +235,10 @@ class Chain:
         if self.lost is not None and now - self._t_identified < _IDENTIFY_PERIOD:
             raise self.lost
         self._t_identified = now
-        before = self._stored
+        before = self.stored
         self._identify(bus)
-        if self._stored != before:
-            self._stored, self._opened = before, 0
+        if self.stored != before:
+            self.stored, self._opened = before, 0
             raise DeviceNotFound(f"{self.name}: other motors, or calibrated otherwise than before", code="other_motors")
         self._t_heard.clear()
 
@@ -245,7 +246,9 @@ class Chain:
         names = "all motors" if len(silent) == len(self.ids) > 1 else ", ".join(silent)
         remedy = "check the motors' power supply and their plugs; a joint without power falls"
         if bus.surplus > bus.lost // 2:
-            remedy = f"answers come late ({bus.surplus} so far): connect the adapter directly, end busy programs"
+            late, remedy = find_latency(bus.port)
+            hint = remedy if late > 1 else "connect the adapter directly, end busy programs"
+            remedy = f"answers come late ({bus.surplus} so far): {hint}"
         fault = Fault("motor_silent", f"no answer from {names} for {1e3 * SILENCE:.0f} ms", remedy)
         return ConnectionLost.of(self.name, fault)
 
@@ -262,15 +265,15 @@ class Chain:
         self.check().write(address, values)
 
     def _spread(self, values: Sequence[int]) -> dict[int, int]:
-        """Return values of the joints for each of their motors."""
-        return {id: value for joint, value in zip(self.joints, values, strict=True) for id in joint.ids}
+        """Return values of the joints, or of the first ones, for each of their motors."""
+        return {id: value for joint, value in zip(self.joints, values, strict=False) for id in joint.ids}
 
     def _count_goals(self, goals: Sequence[int]) -> dict[int, int]:
         """Return goals as the motors count them."""
         return {id: goal + TURN * self._turns.get(id, 0) for id, goal in self._spread(goals).items()}
 
     def write_goals(self, goals: Sequence[int]) -> None:
-        """Send the goals of the joints, counts."""
+        """Send the goals of the joints, or of the first ones, counts."""
         address, size = self.protocol.goal
         values = {id: goal.to_bytes(size, "little", signed=True) for id, goal in self._count_goals(goals).items()}
         self.write(address, values)
@@ -280,17 +283,19 @@ class Chain:
         self.write(self.protocol.limit, dict.fromkeys(self.ids, limit.to_bytes(2, "little")))
 
     def prepare(self, goals: Sequence[int], limits: Sequence[int]) -> None:
-        """Give motors that are off their goals, counts, and torque limits, and take away their profile."""
+        """Give motors that are off their goals, counts, and torque limits, and take away their profile.
+
+        Those of all joints, or of the first ones.
+        """
         counts, spread = self._count_goals(goals), self._spread(limits)
-        for address, values in self.protocol.prepare(
-            self.ids, [counts[id] for id in self.ids], [spread[id] for id in self.ids], self._watch
-        ):
+        for address, values in self.protocol.prepare([*counts], [*counts.values()], [*spread.values()], self._watch):
             self.write(address, values)
         self._watched = self._watch
 
-    def switch_on(self) -> None:
-        """Switch the torque of all motors on, which also ends an overload of a Feetech motor."""
-        self.write(self.protocol.torque, dict.fromkeys(self.ids, b"\x01"))
+    def switch(self, on: bool, joints: int | None = None) -> None:
+        """Switch the torque of all joints, or of the first ones; on also ends an overload of a Feetech motor."""
+        ids = self._spread([on] * (len(self.joints) if joints is None else joints))
+        self.write(self.protocol.torque, dict.fromkeys(ids, bytes((on,))))
 
     def fault(self, states: Sequence[MotorState]) -> Fault | None:
         """Return the most telling of the motors' errors; None if there is none."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from math import inf
-from typing import ClassVar
 
 import numpy as np
 
@@ -13,10 +12,8 @@ from hal.errors import Fault
 from hal.specs import GripperSpec
 
 from .chain import Chain, Joint
-from .dynamixel import Dynamixel
-from .feetech import Feetech
-from .protocol import COUNT, MotorState, ServoProtocol
-from .settings import ServoGripperSettings
+from .protocol import COUNT, MotorState
+from .settings import PROTOCOLS, ServoGripperSettings
 
 _AT_REST = 0.15
 """Time without motion after which the jaw is at rest, s."""
@@ -35,11 +32,10 @@ class ServoGripper(GripperDriver):
     holds its last goal for ever, with that limit.
     """
 
-    protocol: ClassVar[ServoProtocol]
-
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
         self.settings = ServoGripperSettings.of(spec)
+        self.protocol = PROTOCOLS[spec.driver]()
         span = abs(spec.opened[0] - spec.closed[0]) if spec.opened and self.settings.widths is None else 0.0
         joint = Joint("the jaw", (self.settings.id,), span)
         self.chain = Chain(spec.name, self.protocol, self.settings, [joint], watch=False)
@@ -133,7 +129,7 @@ class ServoGripper(GripperDriver):
             count = self._count(here)
             if state.goal == count and state.torque_limit == self._limit:
                 self._ramp = here
-                self.chain.switch_on()
+                self.chain.switch(True)
             else:
                 self.chain.prepare([count], [self._limit])
             self._t_moved = self._now
@@ -175,15 +171,3 @@ class ServoGripper(GripperDriver):
             ramp = min(max(self._width(state.position), 0.0), self.spec.width_max)
             self._send(state, ramp)
         self._goal = self._ramp = ramp
-
-
-class FeetechGripper(ServoGripper):
-    """A gripper with a Feetech servo."""
-
-    protocol = Feetech()
-
-
-class DynamixelGripper(ServoGripper):
-    """A gripper with a Dynamixel servo."""
-
-    protocol = Dynamixel()

@@ -1,10 +1,11 @@
-"""Drivers of leader arms on a servo bus: the motors have no torque, and nothing is written to them."""
+"""Drivers of leader arms on a servo bus: their motors have no torque, but while they follow an arm, where they may."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from math import pi
-from typing import ClassVar, Literal
+from typing import Literal
 
 from hal.config.files import Problems, check_record, validate
 from hal.config.schema import Strict
@@ -13,13 +14,14 @@ from hal.leader import Angles, LeaderDriver
 from hal.specs import PadSpec
 
 from .chain import Chain, Joint
-from .dynamixel import Dynamixel
-from .feetech import Feetech
-from .protocol import COUNT, ServoProtocol
-from .settings import MotorId, ServoSettings
+from .protocol import COUNT, MotorState
+from .settings import PROTOCOLS, MotorId, ServoSettings, check_baud
 
 _WIDEST = 3.0
 """Widest range of a calibrated lever, rad."""
+_SPEED, _LEAD, _MOVED = 0.5, 0.3, 40
+"""Speed at which the goals of a leader that follows come to the arm's joints, rad/s, how far they are ahead of it at
+most, rad, and how far it may be moved while its torque is switched on, counts: chosen."""
 
 
 class ServoLeaderSettings(Strict):
@@ -49,22 +51,27 @@ def check_leader(spec: PadSpec) -> Iterator[tuple[str, str, str]]:
         yield "options.ids", f"has {len(settings.ids)} motors for {len(spec.leader.joints)} joints", "wrong_count"
     if settings.lever is None and spec.leader.lever != "none":
         yield "options.lever", "is missing: the id of its motor; or set lever: none", "missing_key"
+    motors = len(settings.ids) + (settings.lever is not None)
+    yield from (("options.baud", *problem) for problem in check_baud(spec.driver, motors, settings.baud))
 
 
 class ServoLeader(LeaderDriver):
     """A leader on a servo bus (options: :class:`ServoLeaderSettings`)."""
 
-    protocol: ClassVar[type[ServoProtocol]]
-
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
         own = self.settings = check_record(ServoLeaderSettings, spec.options, f"leaders.{spec.name}.options")
+        self.protocol = PROTOCOLS[spec.driver]()
         motors = dict(zip(self.leader.joints, own.ids, strict=True))
         if own.lever is not None:
             motors["the lever"] = own.lever
         joints = [Joint(label, (id,), 0.0) for label, id in motors.items()]
         bus = ServoSettings(port=own.port, baud=own.baud)
-        self.chain = Chain(spec.name, self.protocol(), bus, joints, watch=False)
+        self.chain = Chain(spec.name, self.protocol, bus, joints, watch=False)
+        self._goal: Sequence[float] = ()
+        """Joint positions that it comes to, rad."""
+        self._mine, self._t_driven = False, 0.0
+        """Whether its torque was switched on here, and when goals were written, s."""
 
     def read_angles(self, now: float) -> Angles:
         chain = self.chain
@@ -73,14 +80,16 @@ class ServoLeader(LeaderDriver):
                 chain.open()
                 self._find_ends()
             states = chain.read(now)
-            holding = [label for label, state in zip(chain.labels, states, strict=True) if state.on]
+            own = len(self.settings.ids) if self._mine else 0
+            holding = [label for label, state in zip(chain.labels[own:], states[own:], strict=True) if state.on]
             if holding:
                 text = f"{', '.join(holding)} has torque: this may be a follower; if not, switch its supply off and on"
                 raise ConnectionLost(text, code="has_torque")
+            angles = [COUNT * (s.position - zero) for s, zero in zip(states, self._zeros, strict=False)]
+            self._drive(states, self.find_joints(angles), now)
         except BaseException:
-            chain.close()
+            self._disconnect()
             raise
-        angles = [COUNT * (s.position - zero) for s, zero in zip(states, self._zeros, strict=False)]
         t = min(state.t for state in states)
         return Angles(t, angles, 0.0 if self.settings.lever is None else self._pulled(COUNT * states[-1].position))
 
@@ -105,18 +114,56 @@ class ServoLeader(LeaderDriver):
         angle -= 2.0 * pi * round((angle - middle) / (2.0 * pi))
         return min(max((self._opened - angle) / (self._opened - self._closed), 0.0), 1.0)
 
-    def close(self) -> None:
-        super().close()
+    def _drive(self, states: Sequence[MotorState], here: Sequence[float], now: float) -> None:
+        """Come to the joints of an arm with little torque and at a bounded speed; let go if there is none to follow."""
+        wanted, chain = self.wanted, self.chain
+        if wanted is not None and (fault := chain.fault(states)) is not None:
+            raise ConnectionLost.of(self.spec.name, fault)
+        states = states[: len(here)]
+        if wanted is None:
+            if self._mine:
+                chain.switch(False, len(here))
+                self._mine = any(state.on for state in states)
+        elif not (self._mine and all(state.on and not state.stopped for state in states)):
+            self._switch_on(states, here)
+        else:
+            step, goals = _SPEED * min(now - self._t_driven, 0.1), []
+            for goal, q, end in zip(self._goal, here, wanted, strict=True):
+                goal += min(max(end - goal, -step), step)
+                goals.append(min(max(goal, q - _LEAD), q + _LEAD))
+            ways = [(b - a) / gain / COUNT for a, b, gain in zip(here, goals, self.leader.gains, strict=True)]
+            self._goal = goals
+            chain.write_goals(self._clip([state.position + way for state, way in zip(states, ways, strict=True)]))
+        self._t_driven = now
+
+    def _switch_on(self, states: Sequence[MotorState], here: Sequence[float]) -> None:
+        """Give the motors their positions as goals, then, if they have these and are still there, their torque."""
+        most = round(self.leader.follow * self.protocol.full)
+        limits = [min(most, registers.limit_max) for registers in self.chain.registers[: len(states)]]
+        ready = [(s.torque_limit, abs(s.goal - s.position) < _MOVED) for s in states]
+        if ready == [(limit, True) for limit in limits]:
+            self._goal, self._mine = here, True
+            self.chain.switch(True, len(states))
+        else:
+            self.chain.prepare(self._clip([state.position for state in states]), limits)
+
+    def _clip(self, counts: Sequence[float]) -> list[int]:
+        """Return goals that the motors take."""
+        ends = [(r.calibration.range_min, r.calibration.range_max, r.turns) for r in self.chain.registers]
+        return [
+            round(x) if turns == 2 else min(max(round(x), low), high)
+            for x, (low, high, turns) in zip(counts, ends, strict=False)
+        ]
+
+    def _disconnect(self) -> None:
+        """Let it go, and release the bus; motors that did not confirm it are told when they answer again."""
+        bus = self.chain.bus
+        if self._mine and bus is not None:
+            with suppress(ConnectionLost):
+                off = [any(bus.store(id, self.protocol.torque, b"\0") for _ in range(3)) for id in self.settings.ids]
+                self._mine = not all(off)
         self.chain.close()
 
-
-class FeetechLeader(ServoLeader):
-    """A leader with Feetech servos, such as that of an SO-101."""
-
-    protocol = Feetech
-
-
-class DynamixelLeader(ServoLeader):
-    """A leader with Dynamixel servos, such as a GELLO."""
-
-    protocol = Dynamixel
+    def close(self) -> None:
+        super().close()
+        self._disconnect()

@@ -15,6 +15,7 @@ from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 
 from .arm import ServoArm
+from .bus import find_latency
 from .chain import Chain
 from .gripper import ServoGripper
 from .protocol import MotorState
@@ -49,6 +50,9 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
             device.open()
             states = device.chain.read(monotonic())
             yield from _check_motors(device.chain, states)
+        late, remedy = find_latency(arm.settings.port)
+        if late > 1:
+            yield CheckResult("adapter", "warn", f"it collects answers for {late} ms", remedy)
         yield from _check_ranges(arm)
         yield _check_answers(arm, max(duration, 0.2))
     except ControlTaken as error:
@@ -67,7 +71,7 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
 
 def _check_motors(chain: Chain, states: Sequence[MotorState]) -> Iterator[CheckResult]:
     lowest, hottest = min(s.voltage for s in states), max(s.temperature for s in states)
-    kinds = Counter((r.model, r.nominal) for r in chain.registers)
+    kinds = Counter((r.model, r.nominal) for r in chain.stored.values())
     kind = ", ".join(f"{count} {model} for {nominal:g} V" for (model, nominal), count in kinds.items())
     found = f"{chain.name}: {kind}; {lowest:.1f} V, {hottest} deg C"
     fault = chain.fault(states)
@@ -81,7 +85,7 @@ def _check_motors(chain: Chain, states: Sequence[MotorState]) -> Iterator[CheckR
         yield CheckResult("motors", "warn", found, "let them cool down")
     else:
         yield CheckResult("motors", "ok", found)
-    slow = [label for label, r in zip(chain.labels, chain.registers, strict=True) if r.return_delay]
+    slow = [chain.motors[id] for id, r in chain.stored.items() if r.return_delay]
     if slow:
         remedy = "set the return delay to 0: hal calibrate arm does"
         yield CheckResult("return delay", "warn", f"{', '.join(slow)} answers late by its return delay", remedy)

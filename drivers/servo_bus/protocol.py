@@ -142,6 +142,15 @@ class ServoProtocol(ABC):
     def place(self, address: int, *size: int) -> bytes:
         """Return the parameters that name registers: the first one, and, but for a write, how many bytes."""
 
+    def time_reading(self, motors: int, baud: int) -> float:
+        """Return how long a reading of so many motors takes on the wire, s: ten bits for each byte."""
+        size = 0
+        for block, count in ((self.state, motors), (self.status, 2)):
+            if block is not None:
+                size += len(self.encode(ALL, SYNC_READ, self.place(*block) + bytes(count)))
+                size += count * len(self.encode_answer(0, 0, bytes(block[1])))
+        return 10.0 * size / baud
+
     @abstractmethod
     def decode_state(self, now: float, answer: Answer, status: bytes) -> MotorState:
         """Return the state in an answer that was asked for at ``now``, s, and the newest :attr:`status`."""

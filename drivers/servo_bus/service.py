@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 from hal import registry
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Problem
 from hal.serial_line import set_baud
-from hal.specs import RobotSpec
+from hal.specs import PadSpec, RobotSpec
 
 from .arm import ServoArm
 from .bus import ServoBus
 from .chain import SPANS
+from .leader import ServoLeader
 from .protocol import ALL, COUNT, PING, TURN, Calibration
 
 _WHOLE = 5.5
@@ -39,18 +40,19 @@ class Motor(NamedTuple):
 
 
 class MotorService:
-    """The motors of an arm and its gripper, also as a context manager. No other program may use the bus.
+    """The motors of an arm and its gripper, or of a leader. No other program may use the bus. Use it in ``with``.
 
     Attributes:
-        motors: The motors, from the gripper's to the base.
+        motors: The motors, from the gripper's or the lever's to the base.
         pose: Where the joints are to be for :meth:`take_middle`, in words.
         seen: Least and greatest count of each motor since :meth:`take_middle`.
     """
 
-    def __init__(self, spec: RobotSpec) -> None:
-        arm: ServoArm = registry.load(spec.driver, "robot")(spec)
+    def __init__(self, spec: RobotSpec | PadSpec) -> None:
+        kind = "robot" if isinstance(spec, RobotSpec) else "leader"
+        arm: ServoArm | ServoLeader = registry.load(spec.driver, kind)(spec)
         devices = [arm.chain]
-        if spec.gripper is not None and spec.gripper.driver == spec.driver:
+        if isinstance(spec, RobotSpec) and spec.gripper is not None and spec.gripper.driver == spec.driver:
             devices.append(registry.load(spec.driver, "gripper")(spec.gripper).chain)
         found = [
             Motor(("gripper" if chain is not arm.chain else joint.label) + "_shadow" * (k > 0), id, joint.span)
@@ -59,7 +61,7 @@ class MotorService:
             for k, id in enumerate(joint.ids)
         ]
         self.name, self.motors = spec.name, found[::-1]
-        self.protocol, self.settings = arm.protocol, arm.settings
+        self.protocol, self.settings = arm.protocol, arm.chain.settings
         zero = arm.settings.zero
         self.middle = TURN // 2 - 1 if zero is None else zero
         self.pose = "to the middle of its range" if zero is None else "to where the model has its 0"

@@ -13,8 +13,14 @@ from pydantic import Field
 from hal.config.files import DeviceSettings
 from hal.specs import GripperSpec, RobotSpec
 
-from .protocol import Calibration
+from .dynamixel import Dynamixel
+from .feetech import Feetech
+from .protocol import Calibration, ServoProtocol
 
+PROTOCOLS: dict[str, type[ServoProtocol]] = {"feetech": Feetech, "dynamixel": Dynamixel}
+"""By the driver."""
+ANSWER = 0.008
+"""Longest time to wait for answers in a cycle of 100 Hz, s."""
 MotorId = Annotated[int, Field(ge=0, le=252, strict=True)]
 
 
@@ -65,6 +71,14 @@ class ServoGripperSettings(ServoSettings):
     """Count at which the angle is 0."""
 
 
+def check_baud(driver: str, motors: int, baud: int) -> Iterator[tuple[str, str]]:
+    """Yield message and code for a rate at which a reading of so many motors takes too long."""
+    took = PROTOCOLS[driver]().time_reading(motors, baud)
+    if took > ANSWER:
+        message = f"{baud} bit/s is too slow: a reading of {motors} motors takes {1e3 * took:.0f} ms, at most "
+        yield f"{message}{1e3 * ANSWER:.0f} are allowed; set the motors, and this, to 1000000", "too_slow"
+
+
 def group_key(options: Mapping[str, Any]) -> str | None:
     """Return a key that arms on one bus share, since only one process can open it. The options are not checked yet."""
     return str(options.get("port"))
@@ -89,6 +103,7 @@ def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
     unknown = [name for name in settings.reversed if name not in spec.joints]
     if unknown:
         yield "real.reversed", f"names {', '.join(unknown)}, which is no joint of the arm", "unknown_joint"
+    yield from (("real.baud", *problem) for problem in check_baud(spec.driver, len(ids), settings.baud))
     yield from _check_file(settings, own)
 
 

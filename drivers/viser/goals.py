@@ -28,6 +28,8 @@ class DraggedGoal(NamedTuple):
 
     seq: int
     """Number of the drag event; never the same twice."""
+    page: int
+    """Number of the page that drags it."""
     position: tuple[float, ...]
     """(3,) m."""
     orientation: tuple[float, ...]
@@ -54,7 +56,7 @@ class HandleDrag:
         self._lock = threading.Lock()
         self._seq = 0
         self._goal: DraggedGoal | None = None
-        self._owner: int | None = None
+        self._owner = 0
         self._grabbed = False
         self._used = 0.0
         self._nearest = inf
@@ -83,7 +85,7 @@ class HandleDrag:
             if pose is None or not self._grabbed or page != self._owner:
                 return False
             self._seq += 1
-            self._goal = DraggedGoal(self._seq, tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
+            self._goal = DraggedGoal(self._seq, page, tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
             self._used, self._nearest = now, inf
             return True
 
@@ -105,7 +107,7 @@ class HandleDrag:
             self._clear()
 
     def _clear(self) -> None:
-        self._goal, self._owner, self._grabbed = None, None, False
+        self._goal, self._owner, self._grabbed = None, 0, False
 
     def update(self, now: float, tcps: Sequence[Pose], *, tripped: bool) -> None:
         """Clear the goal where it is reached, unused, or older than a trip.

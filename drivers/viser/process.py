@@ -23,7 +23,7 @@ from hal.host.records import GroupMemory
 from hal.host.scheduling import yield_to_others
 from hal.specs import GroupSpec, from_json
 
-from .scene import ArmView, BodiesView
+from .scene import PAGE, ArmView, BodiesView
 
 _NICE = 10
 """Niceness of this process: everything else comes first."""
@@ -75,7 +75,12 @@ def start_server(address: str, label: str) -> PrivateServer:
     original = websockets.asyncio.server.serve
 
     def serve_private(handler: Any, host: str, port: int, **options: Any) -> Any:
-        return original(handler, unix=True, path=address, **options)
+        async def handle(connection: Any) -> None:
+            page = connection.request.path[1:]
+            PAGE.set(int(page) if page.isdecimal() else 0)
+            await handler(connection)
+
+        return original(handle, unix=True, path=address, **options)
 
     # viser has no setting for this. It finds the function in its module, and calls it in its constructor.
     websockets.asyncio.server.serve = serve_private  # type: ignore[misc,assignment]
@@ -133,9 +138,9 @@ class ViewerPage:
         """Whether a page is open."""
         return bool(self._server.get_clients())
 
-    async def _on_disconnect(self, client: ClientHandle) -> None:
+    async def _on_disconnect(self, _: ClientHandle) -> None:
         for arm in self.arms:
-            arm.drag.leave(client.client_id)
+            arm.drag.leave(PAGE.get())
 
     async def _reset_handles(self, _: GuiEvent) -> None:  # type: ignore[type-arg]
         """Put all handles back to their tcps, and clear their goals."""
@@ -160,7 +165,7 @@ class ViewerPage:
         if numbers == self._sent and (not goals or now < self._report_due):
             return
         self._sent, self._report_due = numbers, now + _REPEAT
-        poses = {robot: [goal.seq, *goal.position, *goal.orientation] for robot, goal in goals.items()}
+        poses = {robot: [goal.seq, goal.page, *goal.position, *goal.orientation] for robot, goal in goals.items()}
         channel.send({"goals": poses, "t": now})
 
     def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ from .meshes import visuals_glb
 
 Vector = Sequence[float] | NDArray[np.float64]
 
+PAGE: ContextVar[int] = ContextVar("page", default=0)
+"""Number of the console's page whose connection is served; 0 for one that came without the console."""
 _OPEN_SIDE = 0.8
 """Distance from the base at which an open side of a workspace is drawn, m."""
 _AMBER = (230, 150, 30)
@@ -89,9 +92,7 @@ class ArmView:
 
     async def _on_drag(self, event: TransformControlsEvent) -> None:
         """Handle a drag on the server's own thread, so that its phases keep their order."""
-        page = event.client_id
-        if page is None:
-            return
+        page = PAGE.get()
         if event.phase == "start":
             self.drag.grab(page)
         elif event.phase == "end":

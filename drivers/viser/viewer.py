@@ -132,11 +132,16 @@ class ViserViewer(Viewer3D):
         return found
 
     def _set_goals(self, goals: dict[str, list[float]], t: float) -> None:
-        """Replace the goals by those of a message, without goals that were cleared meanwhile."""
-        reported = {}
-        for robot, (seq, *numbers) in goals.items():
+        """Replace the goals by those of a message, without goals that were cleared meanwhile.
+
+        Of the console's pages only the one in control may drag; the handle of another one goes back.
+        """
+        reported, console = {}, self.rig.console
+        for robot, (seq, page, *numbers) in goals.items():
             pose = checked_pose(numbers[:3], numbers[3:])
-            if pose is not None and robot in self._robots and isfinite(t):
+            if console is not None and console.driver != f"page {page:.0f}":
+                self.clear_goal(robot)
+            elif pose is not None and robot in self._robots and isfinite(t):
                 reported[robot] = _ReportedGoal(int(seq), t, pose)
         with self._lock:
             self._goals = {robot: goal for robot, goal in reported.items() if goal.seq > self._cleared[robot]}

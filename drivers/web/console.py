@@ -64,7 +64,6 @@ class WebConsole(Console):
         """
         super().__init__(rig, listen, driven_by=driven_by)
         self._queues: list[PadQueue] = []
-        self._driver: str | None = None
         self._token = secrets.token_urlsafe(_TOKEN_BYTES)
         self._address, self._port = listen.address, listen.port
         self._tls = needs_keys(listen.address) and find_credentials("host") is not None
@@ -126,11 +125,6 @@ class WebConsole(Console):
     # The pad's side, see WebPad.
 
     @property
-    def driver(self) -> str | None:
-        """Name of the page in control; None if there is none."""
-        return self._driver
-
-    @property
     def stop_count(self) -> int:
         """Number that grows with every ``rig.stop()``."""
         return self.rig.stop_count
@@ -188,7 +182,7 @@ class WebConsole(Console):
         self._setting_handler = changed
 
     def _process_lost(self) -> None:
-        self._driver = None
+        self.driver = None
         self._put_reading(lost_reading(time.monotonic(), 0))
         print("the console has ended: no page can drive or stop any more; start the program again", file=sys.stderr)
 
@@ -206,7 +200,7 @@ class WebConsole(Console):
             page = message["stop"]
             self._channel.send("say", t=time.monotonic(), text=f"STOP was pressed on {page}", stop=page)
         elif "driver" in message:
-            self._driver = message["driver"]
+            self.driver = message["driver"]
         elif "watched" in message:
             self._watched = frozenset(message["watched"])
         elif "recover" in message:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import deque
 from collections.abc import Callable, Collection
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -28,11 +29,14 @@ _LEFT = {
     "blur": "the page lost the keyboard focus",
     "closing": PAGE_CLOSED,
     "hands": RELEASE_MISSED,
+    "headset": "the headset shows something else",
 }
 _MIN_SPEED = 0.01
 """Smallest share of the mapping's speeds that a page may set."""
 _RANGES = tuple((0.0 if axis in ONE_SIDED else -1.0, 1.0) for axis in STICK_AXES)
 _MASKS = 1 << len(BUTTONS)
+_POSE = ((-100.0, 100.0),) * 3 + ((-1.01, 1.01),) * 4
+"""Ranges of a pose: m, and a unit quaternion."""
 _MAX_TIME = 1e9
 """ms, and s: more than any clock here shows."""
 
@@ -52,6 +56,8 @@ class PadMessage(NamedTuple):
     """In the order of ``hal.types.STICK_AXES``: sticks -1..1, triggers 0..1."""
     buttons: int
     """Bit k: button k of ``hal.types.BUTTONS`` is pressed."""
+    pose: tuple[float, ...] = ()
+    """That of ``hal.types.PadState``."""
 
 
 class PageLeft(NamedTuple):
@@ -140,16 +146,21 @@ class _Names(NamedTuple):
 
 
 def _pad_message(_: _Names, seen: object, since: object, axes: object, buttons: object) -> PadMessage:
-    if not isinstance(axes, list) or len(axes) != len(_RANGES):
-        raise MalformedMessage(f"not {len(_RANGES)} axes")
     if type(buttons) is not int or not 0 <= buttons < _MASKS:
         raise MalformedMessage("not a mask of buttons")
     return PadMessage(
         seen=_number(seen, 0.0, _MAX_TIME),
         since=_number(since, 0.0, _MAX_TIME) / 1000.0,
-        axes=tuple(_number(value, *limits) for value, limits in zip(axes, _RANGES, strict=True)),
+        axes=_numbers(axes, _RANGES),
         buttons=buttons,
     )
+
+
+def _hand_message(_: _Names, pose: object, **pad: object) -> PadMessage:
+    numbers = _numbers(pose, _POSE)
+    if not 0.99 < math.hypot(*numbers[3:]) < 1.01:
+        raise MalformedMessage("not a unit quaternion")
+    return _pad_message(_, **pad)._replace(pose=numbers)
 
 
 def _setting(known: _Names, name: object, value: object) -> DriverRequest:
@@ -173,6 +184,7 @@ def _watch(known: _Names, cameras: object) -> WatchRequest:
 
 _MESSAGES: dict[str, tuple[set[str], Callable[..., PageMessage]]] = {
     "pad": ({"seen", "since", "axes", "buttons"}, _pad_message),
+    "hand": ({"seen", "since", "axes", "buttons", "pose"}, _hand_message),
     "away": ({"why"}, lambda _, why: PageLeft(_LEFT[_check_choice(why, _LEFT)])),
     "lease": ({"take"}, lambda _, take: ControlRequest(_flag(take))),
     "stop": (set(), lambda _: StopRequest()),
@@ -196,6 +208,12 @@ def _number(value: object, low: float, high: float) -> float:
     if not low <= value <= high:
         raise MalformedMessage("a number out of its range")
     return float(value)
+
+
+def _numbers(values: object, ranges: tuple[tuple[float, float], ...]) -> tuple[float, ...]:
+    if not isinstance(values, list) or len(values) != len(ranges):
+        raise MalformedMessage(f"not {len(ranges)} numbers")
+    return tuple(_number(value, *limits) for value, limits in zip(values, ranges, strict=True))
 
 
 def _flag(value: object) -> bool:

@@ -46,6 +46,7 @@ def pad_reading(message: Mapping[str, Any], seq: int) -> PadReading:
         axes=MappingProxyType(dict(zip(STICK_AXES, map(float, message["axes"]), strict=True))),
         buttons=frozenset(name for bit, name in enumerate(BUTTONS) if mask >> bit & 1),
         connected=True,
+        pose=tuple(map(float, message["pose"])),
     )
 
 
@@ -157,8 +158,7 @@ class WebPad(GamepadDriver):
             self._lost_until = now + _LOST_TIME
         elif found.connected and now < self._lost_until:
             found = lost_reading(found.t, 0)
-        same = (found.axes, found.buttons, found.connected) == (last.axes, last.buttons, last.connected)
-        if same:
+        if found[4:] == last[4:]:  # axes, buttons, connection, pose
             self._reported = last._replace(t_alive=max(last.t_alive, found.t_alive))
         else:
             t = max(last.t, found.t)

@@ -257,7 +257,8 @@ class WebSession:
             self._lose_pad(now, verdict.lost)
         if verdict.t_alive is not None:
             pad = {"connected": True, "t": now, "t_alive": verdict.t_alive, "axes": message.axes}
-            self._to_app.put_newest("pad", {"pad": {**pad, "buttons": message.buttons, "from": page.name}})
+            pad |= {"buttons": message.buttons, "pose": message.pose, "from": page.name}
+            self._to_app.put_newest("pad", {"pad": pad})
         self._flush()
         page.queue.put_newest("beat", encode({"type": "beat", "t": watch.stamp(now)}))
 

@@ -31,34 +31,38 @@ class Stage:
     """Requests for the 3D view."""
 
     def __init__(self, address: str, path: str) -> None:
-        """``address`` is that of the socket of viser's server, ``path`` the view's on this server; empty: none."""
+        """``address`` is that of the socket of viser's server, ``path`` the view's on this server; empty: none.
+
+        A page appends its number to the path: what it drags counts while it is in control.
+        """
         self._address = address
         self._path = path.encode()
         self._open = 0
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
         """Answer with viser's page, or pass the messages of its socket on until one side is gone."""
-        asked = request.path.rstrip("/").encode(errors="surrogateescape")
-        if not self._path or not hmac.compare_digest(asked, self._path):
+        path, _, page = request.path.rstrip("/").rpartition("/")
+        known = hmac.compare_digest(path.encode(errors="surrogateescape"), self._path)
+        if not self._path or not known or not page.isdecimal():
             raise web.HTTPNotFound(text="there is no such view\n")
         try:
             async with ClientSession(connector=UnixConnector(self._address)) as viewer:
                 if "Upgrade" in request.headers:
-                    return await self._connect(request, viewer)
+                    return await self._connect(request, viewer, page)
                 async with viewer.get(_SERVER) as answer:
                     body = await answer.read()
                     return web.Response(body=body, status=answer.status, headers={"Content-Type": answer.content_type})
         except (ClientError, OSError):
             raise web.HTTPBadGateway(text="the 3D view has ended\n") from None
 
-    async def _connect(self, request: web.Request, viewer: ClientSession) -> web.WebSocketResponse:
+    async def _connect(self, request: web.Request, viewer: ClientSession, page: str) -> web.WebSocketResponse:
         transport = request.transport
         if self._open >= MAX_PAGES or not isinstance(transport, asyncio.Transport):
             raise web.HTTPServiceUnavailable(text="too many pages are open\n")
         offered = [name.strip() for name in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
         self._open += 1
         try:
-            async with viewer.ws_connect(_SERVER, protocols=offered, max_msg_size=0) as far:
+            async with viewer.ws_connect(_SERVER + page, protocols=offered, max_msg_size=0) as far:
                 near = await open_socket(request, PING_AFTER, offered, _MAX_BYTES)
                 with request.app[CONNECTIONS].exempt(transport):
                     limit = RateLimit()

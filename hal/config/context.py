@@ -29,6 +29,7 @@ from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
 Model = TypeVar("Model", RobotModel, CameraModel)
+Spec = TypeVar("Spec", RobotSpec, CameraSpec)
 Config = RobotConfig | GripperConfig | CameraConfig
 DrivenModel = RobotModel | GripperModel | CameraModel
 
@@ -61,8 +62,8 @@ class Context:
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
     gripper_files: dict[str, Path] = field(default_factory=dict)
     """Files of the grippers that are not part of their arm's model, by the keys of the arms in the rig."""
-    served: dict[str, dict[str, RobotSpec]] = field(default_factory=dict)
-    """Arms at other computers, by their address and name; those that were asked."""
+    served: dict[str, dict[str, RobotSpec | CameraSpec]] = field(default_factory=dict)
+    """Devices at other computers, by their address and name; those that were asked."""
 
     @property
     def rig_sim(self) -> bool:
@@ -104,9 +105,27 @@ class Context:
                 return owner.sim
         return self.rig_sim
 
-    def is_served(self, config: RobotConfig) -> bool:
-        """Return whether an arm is at another computer, and is not simulated here in its place."""
+    def is_served(self, config: RobotConfig | CameraConfig) -> bool:
+        """Return whether a device is at another computer, and is not simulated here in its place."""
         return config.at is not None and self.sim is not True and self.driver is None and config.sim is not True
+
+    def find_served(self, kind: type[Spec], key: str, at: str) -> Spec | None:
+        """Return the record of a device at another computer; None, with the problem added, if there is no such device.
+
+        Raises:
+            ConnectionLost: Nothing answers there.
+            HalError: The other computer's refusal.
+        """
+        from ..remote.client import fetch_devices
+
+        if at not in self.served:
+            self.served[at] = fetch_devices(at)
+        section, name = key.split(".", 1)
+        there = {name: device for name, device in self.served[at].items() if isinstance(device, kind)}
+        if name not in there:
+            what, has = section.removesuffix("s"), ", ".join(there) or "none"
+            self.report(key, f"the rig at {at} has no {what} {name!r}; it has: {has}", f"unknown_{what}")
+        return there.get(name)
 
     def read_model(
         self, kind: type[Model], key: str, config: RobotConfig | CameraConfig, folder: str, *parts: str

@@ -8,7 +8,6 @@
     invalid_choice  conflict       empty_range
     bad_name        bad_rotation   invalid
     missing_file    unreadable     bad_yaml        a file
-    too_large
 
 An unknown name has the code ``unknown_`` with its kind, for example ``unknown_model`` or ``unknown_link``; drivers add
 codes of their own.
@@ -102,9 +101,6 @@ def copy_plain(value: Any) -> Any:
 # The loader in C is ten times as fast; PyYAML can be built without it.
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-MAX_BYTES, MAX_DEPTH, MAX_VALUES = 1 << 20, 50, 20_000
-"""Limits of one document: a rig needs a hundredth of each. Aliases count as often as they are used."""
-
 
 class PlacedErrors:
     """Mix-in of a loader: a value that cannot be built (``2001-99-99``, ``!!int x``) is a YAMLError with its place.
@@ -139,8 +135,7 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
     A key that is given twice is a problem, too.
     """
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1).decode("utf-8")
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
         hint = suggest(path.name, siblings) if siblings else ""
@@ -151,8 +146,12 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
         return None
     try:
         data, twice = _read_document(text)
+        data = copy_plain(data)
     except yaml.YAMLError as error:
-        problems.add(path, "", describe_yaml_error(error), getattr(error, "code", "bad_yaml"))
+        problems.add(path, "", describe_yaml_error(error), "bad_yaml")
+        return None
+    except RecursionError:
+        problems.add(path, "", "is nested too deeply, or has an alias inside itself", "bad_yaml")
         return None
     for key, message in twice:
         problems.add(path, key, message, "duplicate_key")
@@ -160,7 +159,7 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
         problem = "is empty" if data is _EMPTY else f"must be keys and values, not {describe(data)}"
         problems.add(path, "", problem, "wrong_type")
         return None
-    return copy_plain(data)  # type: ignore[no-any-return]
+    return data
 
 
 _EMPTY = object()
@@ -169,7 +168,6 @@ _EMPTY = object()
 @lru_cache(maxsize=64)  # the files of a rig, which an app may open again and again
 def _read_document(text: str) -> tuple[Any, tuple[tuple[str, str], ...]]:
     """Return the data of a document, ``_EMPTY`` if it has none, and the keys that are given twice, with messages."""
-    check_size(text)
     loader = _Loader(text)
     try:
         node = loader.get_single_node()
@@ -183,7 +181,6 @@ def _read_document(text: str) -> tuple[Any, tuple[tuple[str, str], ...]]:
 
 def parse_yaml(text: str) -> Any:
     """Return the data of one YAML document. Raises yaml.YAMLError for everything that is wrong with it."""
-    check_size(text)
     return yaml.load(text, Loader=_Loader)
 
 
@@ -193,63 +190,6 @@ def describe_yaml_error(error: yaml.YAMLError) -> str:
     problem = getattr(error, "problem", None) or getattr(error, "context", None) or str(error)
     place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
     return f"is not valid YAML: {' '.join(problem.split())}{place}"
-
-
-class _TooLarge(yaml.MarkedYAMLError):
-    code = "too_large"
-
-
-def check_size(text: str, loader: Any = _SafeLoader) -> None:
-    """Check depth, aliases and number of values of a YAML document before it is loaded.
-
-    libyaml's composer is recursive and has no limit of its own: deep nesting would end the process.
-
-    Raises:
-        yaml.YAMLError: The document exceeds a limit, or is not valid YAML.
-    """
-    if len(text) > MAX_BYTES:
-        raise _TooLarge(problem=f"is larger than {MAX_BYTES // 1024} KiB")
-    mark: Any
-    open_nodes: list[tuple[str | None, int, int]] = [(None, 0, 0)]  # anchor, values, levels below
-    anchors: dict[str, tuple[int, int] | None] = {}  # values and levels; None while it is open
-    for event in _events(text, loader):
-        mark = event.start_mark
-        if isinstance(event, yaml.CollectionStartEvent):
-            open_nodes.append((event.anchor, 1, 1))
-            if event.anchor is not None:
-                anchors[event.anchor] = None
-            values, levels = 0, 0
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, values, levels = open_nodes.pop()
-            if anchor is not None:
-                anchors[anchor] = values, levels
-        elif isinstance(event, yaml.AliasEvent):
-            known = anchors.get(str(event.anchor), (1, 0))
-            if known is None:
-                raise _TooLarge(problem=f"alias *{event.anchor} is inside itself", problem_mark=mark)
-            values, levels = known
-        elif isinstance(event, yaml.ScalarEvent):
-            values, levels = 1, 0
-            if event.anchor is not None:
-                anchors[event.anchor] = values, levels
-        else:
-            continue
-        anchor, before, below = open_nodes[-1]
-        open_nodes[-1] = anchor, before + values, max(below, levels + 1)
-        if len(open_nodes) + levels > MAX_DEPTH + 1:
-            raise _TooLarge(problem=f"nested more than {MAX_DEPTH} deep", problem_mark=mark)
-        if before + values > MAX_VALUES:
-            raise _TooLarge(problem=f"more than {MAX_VALUES} values, those behind aliases included", problem_mark=mark)
-
-
-def _events(text: str, loader: Any) -> Iterator[Any]:
-    """Yield the events of a document. libyaml 0.2.6 refuses a thousand levels that it reads ahead by itself."""
-    try:
-        yield from yaml.parse(text, Loader=loader)
-    except yaml.MarkedYAMLError as error:
-        if "nesting depth" not in (error.problem or ""):
-            raise
-        raise _TooLarge(problem=f"nested more than {MAX_DEPTH} deep", problem_mark=error.problem_mark) from error
 
 
 def _find_duplicates(node: yaml.Node, place: tuple[str, ...], seen: set[int]) -> Iterator[tuple[str, str]]:

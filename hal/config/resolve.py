@@ -29,7 +29,7 @@ from .resolve_cameras import resolve_camera
 from .resolve_leaders import resolve_leader
 from .resolve_randomize import resolve_randomize
 from .resolve_robots import resolve_robot
-from .rigfile import Device, PadConfig, RobotConfig
+from .rigfile import CameraConfig, Device, PadConfig, RobotConfig
 from .schema import Unknown
 
 CHOSEN_LATER = "auto"
@@ -256,7 +256,7 @@ def _check_clock(context: Context) -> None:
         for name, config in devices.items():
             with suppress(Unknown):
                 key = f"{section}.{name}"
-                if isinstance(config, RobotConfig) and context.is_served(config):
+                if isinstance(config, (RobotConfig, CameraConfig)) and context.is_served(config):
                     context.report(
                         key, "is at another computer: use the clock real_time, or --sim", "real_in_lock_step"
                     )

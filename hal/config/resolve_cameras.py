@@ -25,6 +25,9 @@ _ONE_SENSOR = ("depth", *(name for name, kind in STREAMS.items() if kind.like))
 def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraSpec | None:
     """Return the record of a camera; None, with the problems added, if there are any."""
     key = f"cameras.{name}"
+    with suppress(Unknown):
+        if context.is_served(config):
+            return _find_served(context, key, str(config.at))
     model, file = context.read_model(CameraModel, key, config, "sensors", "cameras")
     if "streams" not in config.model_fields_set:
         with suppress(Unknown):
@@ -49,6 +52,13 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
         check_camera_spec(context, key, spec, config, model, file)
         return spec
     return None
+
+
+def _find_served(context: Context, key: str, at: str) -> CameraSpec | None:
+    """Return the record of a camera at another computer, whose frames have their pose; None, with the problem added."""
+    spec = context.find_served(CameraSpec, key, at)
+    here = spec is not None and spec.view is not None and spec.view.robot in (None, *context.urdfs)
+    return spec if spec is None or here else replace(spec, view=None)
 
 
 def _make_spec(

@@ -74,6 +74,8 @@ def _make_leader(context: Context, key: str, config: LeaderConfig, model: Leader
         context.report(f"{key}.signs", "must be 1 or -1 each", "out_of_range")
     lever = config.lever or ("none" if config.deadman and model.lever == "deadman" else model.lever)
     deadman = config.deadman or (next(iter(context.rig.gamepads), None) if lever != "deadman" else None)
+    if config.follow and deadman is None and lever != "deadman":
+        context.report(f"{key}.follow", "needs a dead-man: a leader without one leads by moving", "conflict")
     kinematics = _find_kinematics(context, key, config, model)
     if context.problems.found:
         return None
@@ -89,6 +91,7 @@ def _make_leader(context: Context, key: str, config: LeaderConfig, model: Leader
         engage=config.engage,
         lever=lever,
         deadman=deadman,
+        follow=config.follow,
     )
 
 

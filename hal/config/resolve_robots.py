@@ -66,7 +66,10 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
     key = f"robots.{name}"
     with suppress(Unknown):
         if context.is_served(config):
-            return _find_served(context, key, name, str(config.at))
+            spec = context.find_served(RobotSpec, key, str(config.at))
+            if spec is not None:
+                context.urdfs[name] = read_urdf(Path(spec.urdf), meshes=False)
+            return spec
         if config.at is not None and not config.model:
             context.report(
                 f"{key}.model", f"is missing: the model of what is at {config.at}, to simulate", "missing_key"
@@ -93,25 +96,6 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
             check_robot_spec(context, key, spec, config, model, file)
             return spec
     return None
-
-
-def _find_served(context: Context, key: str, name: str, at: str) -> RobotSpec | None:
-    """Return the record of an arm at another computer; None, with the problem added, if that has no such arm.
-
-    Raises:
-        ConnectionLost: Nothing answers there.
-        HalError: The other computer's refusal.
-    """
-    from ..remote.client import fetch_robots
-
-    if at not in context.served:
-        context.served[at] = fetch_robots(at)
-    there = context.served[at]
-    if name not in there:
-        context.report(key, f"the rig at {at} has no robot {name!r}; it has: {', '.join(there)}", "unknown_robot")
-        return None
-    context.urdfs[name] = read_urdf(Path(there[name].urdf), meshes=False)
-    return there[name]
 
 
 def _make_spec(

@@ -203,6 +203,14 @@ class Device(Strict):
     """Options of the simulated driver."""
 
 
+class ServedDevice(Device):
+    """Keys of every robot and camera."""
+
+    at: Address | None = None
+    """The computer that serves this device (``hal serve``), ``NAME`` or ``NAME:PORT``. Its rig has a device of this
+    name, with all settings; the other keys of this entry are for ``--sim``."""
+
+
 class LimitsConfig(LimitsModel):
     """Tighter limits than the model's, per joint or one number for all; rad, rad/s, rad/s2, rad/s3, Nm."""
 
@@ -247,12 +255,9 @@ def _expand_gripper(value: Any) -> Any:
     return {"model": value} if isinstance(value, str) else value
 
 
-class RobotConfig(Device):
+class RobotConfig(ServedDevice):
     """An arm."""
 
-    at: Address | None = None
-    """The computer that serves this arm (``hal serve``), ``NAME`` or ``NAME:PORT``. Its rig has an arm of this name,
-    with all settings; the other keys of this entry are for ``--sim``."""
     model: str = ""
     """A name in ``robots/``, or the path of a file of your own."""
     arm: Name | None = None
@@ -330,10 +335,10 @@ class IntrinsicsConfig(Strict):
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
 
 
-class CameraConfig(Device):
+class CameraConfig(ServedDevice):
     """A camera. One of ``look_at``, ``pose`` and ``attached`` gives its pose."""
 
-    model: str
+    model: str = ""
     """A name in ``sensors/cameras/``, or the path of a file of your own."""
     capture: Capture | None = None
     """One of the model's modes, for every stream without its own size and rate."""
@@ -407,6 +412,8 @@ class LeaderConfig(LeaderJoints):
     own position, at the arm's ``move_speed``."""
     pose_scale: Annotated[float, Quantity("", 0.0, 10.0, above=True)] = 1.0
     """Way of the arm's tcp for each m of the leader's, if it leads by poses."""
+    follow: Annotated[float, Quantity("", 0.0, 0.5)] = 0.0
+    """Share of its motors' torque with which the leader follows the arm while a policy drives it; 0: it never does."""
 
 
 def _check_engine(name: str) -> str:

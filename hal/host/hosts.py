@@ -5,6 +5,7 @@ Both look the same to the public classes: mailboxes in memory, requests, and a c
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -115,8 +116,6 @@ SILENT = 1.5
 state.)"""
 CLOSE_LIMIT = 8.0
 """Longest time that one arm's driver may take to close, s: an arm without brakes is lowered slowly first."""
-PAD_PERIOD = 0.01
-"""Period at which pads are polled in lock-step, simulated s."""
 
 
 class Host(ABC):
@@ -144,6 +143,9 @@ class Host(ABC):
 
     def beat(self) -> None:  # noqa: B027  # in lock-step every cycle has them
         """Send the app's sign of life and the number of stops now. Any thread may call it, at any time."""
+
+    def wake(self) -> None:  # noqa: B027  # hosts look for commands in every cycle
+        """Make known that there is a new command."""
 
     def request_close(self) -> None:  # noqa: B027  # most have nothing to do before
         """Begin to close, without waiting, where that is possible: the hosts of a rig close at the same time."""
@@ -182,10 +184,9 @@ class LocalHost(Host):
         self.cycle = Cycle(spec, self.memory, [other.memory for other in others])
         self.cycle.turn = self._step
         self.pollers: list[Callable[[float], object]] = []
-        """Functions (pads) that are called with the time, every :data:`PAD_PERIOD` of simulated time."""
+        """Functions (pads) that are called with the time in every step."""
         self._busy = threading.RLock()
         """Held while time advances: in one thread only."""
-        self._next_poll = 0.0
         self._closed = False
         self.cycle.open(0.0)
         self.memory.host.write(0.0, 0, 0, True)
@@ -211,10 +212,8 @@ class LocalHost(Host):
     def _step(self) -> None:
         cycle = self.cycle
         now = (cycle.ticks + 1) * cycle.dt
-        if now >= self._next_poll:
-            for poll in self.pollers:
-                poll(now)
-            self._next_poll = now + PAD_PERIOD
+        for poll in self.pollers:
+            poll(now)
         for other in self._others:
             other.advance_to(now)
         cycle.step(now, AppRecord(now, self.latch.stops))
@@ -267,7 +266,6 @@ class RemoteHost(Host):
         shared: SharedMemory | None = None,
         others: Sequence[tuple[GroupSpec, SharedMemory]] = (),
         latch: StopLatch | None = None,
-        beating: bool = True,
     ) -> None:
         """Start the process.
 
@@ -278,8 +276,6 @@ class RemoteHost(Host):
             others: Groups whose arms have copies in this one's world, must not be touched, or have this one's gripper,
                 with their memories.
             latch: The rig's latched stop.
-            beating: Whether this process is the program that uses the group. Otherwise it writes the heartbeat of the
-                one that does, from elsewhere.
         """
         super().__init__(latch)
         self.spec = spec
@@ -296,11 +292,11 @@ class RemoteHost(Host):
         """Time at which the process is killed, s; None before it was asked to close."""
         self._asking = threading.Lock()
         self._writing = threading.RLock()  # a signal handler may stop the rig in the middle of a beat
+        self._lent = False
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._heartbeat, name=f"hal-heartbeat-{spec.name}", daemon=True)
-        if beating:
-            self.beat()
-            self._thread.start()
+        self.beat()
+        self._thread.start()
 
     @staticmethod
     def allocate(spec: GroupSpec) -> SharedMemory:
@@ -321,7 +317,18 @@ class RemoteHost(Host):
         if self.forked:
             raise self._make_fork_error()
         with self._writing:
-            self.memory.app.write(time.monotonic(), self.latch.stops)
+            if not self._lent:
+                self.memory.app.write(time.monotonic(), self.latch.stops)
+
+    def lend(self, lent: bool) -> None:
+        """Leave the heartbeat to the program at another computer that has the group, or write it again."""
+        with self._writing:
+            self._lent = lent
+
+    def wake(self) -> None:
+        if self.spec.at is not None:
+            with contextlib.suppress(ConnectionLost):  # the next check says how it ended
+                self.child.channel.send_if_free(None)
 
     def _heartbeat(self) -> None:
         while not self._closed.wait(HEARTBEAT):
@@ -366,13 +373,12 @@ class RemoteHost(Host):
         assert self._close_by is not None
         self.child.close(timeout=max(0.0, self._close_by - time.monotonic()))
         self._closed.set()
-        if self._thread.ident is not None:
-            self._thread.join(timeout=1.0)
+        self._thread.join(timeout=1.0)
         self.shared.close()
 
 
 def start_processes(
-    groups: Sequence[GroupSpec], realtime: bool, latch: StopLatch | None = None, beating: bool = True
+    groups: Sequence[GroupSpec], realtime: bool, latch: StopLatch | None = None
 ) -> Iterator[RemoteHost]:
     """Start the process of each group in real time, and yield its host at once, so that the caller can close it.
 
@@ -384,7 +390,7 @@ def start_processes(
         seen = group.world is not None or bool(group.neighbours) or not group.robots
         others = [pair for pair in memories if seen and pair[0] is not group and pair[0].at is None]
         urgent = realtime and bool(group.robots)
-        yield RemoteHost(group, realtime=urgent, shared=shared, others=others, latch=latch, beating=beating)
+        yield RemoteHost(group, realtime=urgent, shared=shared, others=others, latch=latch)
 
 
 class SteppedHost(RemoteHost):

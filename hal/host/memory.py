@@ -191,15 +191,19 @@ class Newest(Generic[Raw, Record]):
     __slots__ = ("_announced", "_decode", "_known", "_read")
 
     def __init__(
-        self, box: Mailbox, read: Callable[[], tuple[int, Raw] | None], decode: Callable[[Raw], Record]
+        self,
+        box: Mailbox,
+        read: Callable[[], tuple[int, Raw] | None],
+        decode: Callable[[Raw], Record],
+        first: Record,
     ) -> None:
         self._announced = box._announced
         self._read = read
         self._decode = decode
-        self._known: tuple[int, Record | None] = (0, None)  # its number, and itself; replaced together
+        self._known = 0, first  # its number, and itself; replaced together
 
-    def get(self) -> Record | None:
-        """Return the newest record, decoded; None before the first one."""
+    def get(self) -> Record:
+        """Return the newest record, decoded; ``first`` before there is one."""
         known = self._known
         if self._announced[0] != known[0]:
             found = self._read()
@@ -208,9 +212,9 @@ class Newest(Generic[Raw, Record]):
         return known[1]
 
 
-def make_reader(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record]) -> Callable[[], Record | None]:
-    """Return a function that returns the newest record of ``box``, decoded."""
-    return Newest(box, box.read, decode).get
+def make_reader(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record], first: Record) -> Callable[[], Record]:
+    """Return a function that returns the newest record of ``box``, decoded; ``first`` before there is one."""
+    return Newest(box, box.read, decode, first).get
 
 
 _T = struct.Struct("<d")

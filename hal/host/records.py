@@ -260,9 +260,9 @@ class GripperMail:
         self.state = Mailbox(buffer[Mailbox.size(_GRIPPER_COMMAND) :], _GRIPPER_STATE + FAULT_FORMAT, GRIPPER_STATES)
         self.history = History(self.state, _gripper_state)
         """The last :data:`GRIPPER_STATES` states."""
-        self.get_command = make_reader(self.command, _command)
+        self.get_command = make_reader(self.command, _command, None)
         """Returns the newest command; None before the first one."""
-        self.get = make_reader(self.state, _record)
+        self.get = make_reader(self.state, _record, None)
         """Returns the newest record; None before the first one."""
 
     @classmethod
@@ -365,19 +365,20 @@ class RobotMail:
         self.command, self.deadman, self.session, self.state = boxes
         self._chunk = SeriesBox(buffer[offset:], _chunk_capacity(n))
         state = self.state
-        self.get_command = make_reader(self.command, self._command)
+        self.get_command = make_reader(self.command, self._command, None)
         """Returns the newest command; None before the first one."""
-        self.get_deadman = make_reader(self.deadman, DeadmanRecord._make)
+        self.get_deadman = make_reader(self.deadman, DeadmanRecord._make, None)
         """Returns the newest record of the dead-man; None before the first one."""
-        self.get_state = Newest(state, state.read_bytes, self._layout.state).get
+        self.get_state = Newest(state, state.read_bytes, self._layout.state, None).get
         """Returns the newest state; None before the first one."""
-        self.peek = Newest(state, state.read_bytes, self._layout.servo).get
+        self.peek = Newest(state, state.read_bytes, self._layout.servo, None).get
         """Returns only the servo's part of the newest state: for every ``send``."""
         self.history = History(state, self._layout.state)
         """The last :data:`STATES` states."""
         self.state_times = self._layout.times
         """Where in a state there are times."""
-        self._newest_session = make_reader(self.session, SessionRecord._make)
+        self.get_session = make_reader(self.session, SessionRecord._make, NO_SESSION)
+        """Returns the newest state of the app's session."""
 
     @staticmethod
     def layouts(n: int) -> tuple[tuple[str, int], ...]:
@@ -427,10 +428,6 @@ class RobotMail:
         """Publish the state of the app's session."""
         self.session.write(*record)
 
-    def get_session(self) -> SessionRecord:
-        """Return the newest state of the app's session."""
-        return self._newest_session() or NO_SESSION
-
     def _command(self, values: tuple[Any, ...]) -> CommandRecord:
         seq, t, deadline, kind, t_event, session, count, *rest = values
         numbers = tuple(rest[:count])
@@ -467,8 +464,10 @@ class GroupMemory:
         offset = Mailbox.size(_APP)
         self.host = Mailbox(buffer[offset:], _HOST)
         offset += Mailbox.size(_HOST)
-        self._newest_app = make_reader(self.app, AppRecord._make)
-        self._newest_host = make_reader(self.host, HostRecord._make)
+        self.get_app = make_reader(self.app, AppRecord._make, AppRecord(0.0, 0))
+        """Returns the app's newest record."""
+        self.get_host = make_reader(self.host, HostRecord._make, HostRecord(0.0, 0, 0, False))
+        """Returns the host's newest record."""
         self.robots: dict[str, RobotMail] = {}
         for name, n in robots:
             self.robots[name] = RobotMail(buffer[offset:], n)
@@ -493,14 +492,6 @@ class GroupMemory:
         """Return the number of bytes for the same arguments as the constructor's."""
         arms = sum(RobotMail.size(n) for _, n in robots)
         return Mailbox.size(_APP) + Mailbox.size(_HOST) + arms + GripperMail.size() * len(list(grippers))
-
-    def get_app(self) -> AppRecord:
-        """Return the app's newest record."""
-        return self._newest_app() or AppRecord(0.0, 0)
-
-    def get_host(self) -> HostRecord:
-        """Return the host's newest record."""
-        return self._newest_host() or HostRecord(0.0, 0, 0, False)
 
 
 def _names(spec: GroupSpec) -> tuple[list[tuple[str, int]], list[str]]:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from ..errors import CommandError, ConnectionLost, HalError
 from ..host.process import Child
 from ..recording.dataset import Episode
-from ..recording.layout import DatasetLayout, finish_replacement, require_libraries
+from ..recording.layout import DatasetLayout, require_libraries
 from ..recording.merging import merge
 from .episode_worker import EpisodeRecipe, EpisodeResult, check_recipe, clean_part
 from .uploads import UploadedEpisodes
@@ -222,7 +222,6 @@ class _GenerateRun:
 
     def _find_done(self) -> dict[int, bool | None]:
         """Return the episodes that earlier runs finished. Raises CommandError for a folder with other content."""
-        finish_replacement(self._out)
         known = DatasetLayout(self._out).info.exists() or not self._out.exists()
         if not known and not (self._out.is_dir() and not any(self._out.iterdir())):
             raise CommandError(f"{self._out} holds no generated dataset; choose a new folder", code="output_exists")

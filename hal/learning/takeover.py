@@ -52,6 +52,7 @@ class Takeover:
                 self.teleop.reset()
                 self.intervals.append((now, now))
         if not self.active:
+            self.teleop.watch()
             return None
         self.intervals[-1] = (self.intervals[-1][0], now)
         if now - self._touched >= self.release:

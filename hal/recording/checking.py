@@ -28,7 +28,6 @@ from .layout import (
     CameraSetup,
     DatasetLayout,
     EpisodePlace,
-    finish_replacement,
     video_names,
 )
 from .validation import dataset_errors
@@ -303,7 +302,6 @@ def check_compatible(
         DatasetError: The dataset is damaged.
     """
     root = layout.root
-    finish_replacement(root)
     if root.exists() and not root.is_dir():
         raise CommandError(f"{root} is a file; a recording needs a folder", code="foreign_dataset")
     if layout.info.exists() and not layout.numbers():

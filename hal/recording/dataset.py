@@ -29,7 +29,6 @@ from .layout import (
     EpisodePlace,
     current_key,
     file_version,
-    finish_replacement,
     require_libraries,
     video_key,
 )
@@ -521,7 +520,6 @@ class Dataset:
 
     def __init__(self, out: str | Path) -> None:
         require_libraries()
-        finish_replacement(out)
         self._layout = layout = DatasetLayout(out)
         self._version = file_version(layout.info)
         foreign = read_foreign(layout) if is_foreign(layout) else None

@@ -343,69 +343,22 @@ class DatasetLayout:
             shutil.rmtree(gone, ignore_errors=True)
 
 
-def finish_replacement(out: str | Path) -> None:
-    """Put a dataset back that :func:`~hal.recording.merge` was replacing when it was interrupted, if there is one.
-
-    Everything that opens or makes a dataset calls it first: a new one in this place would hide the old one.
-    """
-    target = DatasetLayout(Path(out).expanduser().resolve())
-    if not _is_hidden(target):
-        return
-    if not target.root.exists():
-        target.beside("replaced").rename(target.root)
-        return
-    try:
-        fd = _lock_file(target)
-        if fd is not None:
-            try:
-                (target.episodes / ".lock").unlink()
-                target.episodes.rmdir()
-                target.beside("replaced").rename(target.root)
-            finally:
-                os.close(fd)
-    except OSError as error:  # the folder is no longer empty, or another program did the same meanwhile
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT):
-            raise
-
-
-def _is_hidden(target: DatasetLayout) -> bool:
-    """Return whether a dataset that was being replaced waits beside its place, and no other one is in this place.
-
-    A folder with no more than a lock is no dataset: a program that waits for the lock makes it between two steps.
-    """
-    own = {str(target.episodes), str(target.episodes / ".lock")}
-    return target.beside("replaced").is_dir() and all(
-        os.path.join(folder, name) in own
-        for folder, folders, files in os.walk(target.root)
-        for name in (*folders, *files)
-    )
-
-
 def put_in_place(building: Path, target: Path, *, replaces: bool) -> None:
     """Move a complete dataset to its place. With ``replaces`` the one that is there is removed.
 
-    Both are exchanged in one step, so that there is a dataset in this place at any moment. On file systems that cannot,
-    :func:`finish_replacement` puts the old one back if the program is killed between two steps.
+    Both are exchanged in one step, so that there is a dataset in this place at any moment.
 
     Raises:
-        OSError: The place is taken, or cannot be renamed; what is there stays as it was.
+        OSError: The place is taken, or the file system cannot exchange folders; what is there stays as it was.
     """
     if not replaces:
         building.rename(target)  # over an empty folder at most
-        sync_to_disk(target.parent)
-        return
-    if not _exchange(building, target):
-        replaced = DatasetLayout(target).beside("replaced")
-        target.rename(replaced)
-        try:
-            building.rename(target)
-        except OSError:
-            with contextlib.suppress(OSError):
-                finish_replacement(target)
-            raise
-        replaced.rename(building)
+    elif _exchange(building, target):
+        shutil.rmtree(building, ignore_errors=True)
+    else:
+        text = "the file system cannot replace a folder in one step, as NFS: choose a new folder for the result"
+        raise OSError(errno.ENOTSUP, text, str(target))
     sync_to_disk(target.parent)
-    shutil.rmtree(building, ignore_errors=True)
 
 
 _HERE, _EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
@@ -481,16 +434,6 @@ def _lock_now(layout: DatasetLayout, only_read: bool) -> int | None:
 
     None if another process holds it, or has put another dataset in this place since the file was opened.
     """
-    finish_replacement(layout.root)
-    fd = _lock_file(layout, only_read)
-    if fd is not None and _is_hidden(DatasetLayout(layout.root.resolve())):
-        os.close(fd)  # made here between two steps of a replacement
-        return None
-    return fd
-
-
-def _lock_file(layout: DatasetLayout, only_read: bool = False) -> int | None:
-    """Return the open lock file of the folder that is in a dataset's place now; None as :func:`_lock_now`."""
     layout.episodes.mkdir(parents=True, exist_ok=True)
     if layout.episodes.is_symlink():
         raise CommandError(f"{layout.episodes} is a link; nothing is recorded through it", code="dataset_link")

@@ -207,18 +207,6 @@ class LiveFolder:
         except OSError:
             return False
 
-    def rescue(self) -> bool:
-        """Write files that were deleted again, from their open handles. Return False if they were moved instead."""
-        if any(os.fstat(file.fileno()).st_nlink for file in self._files.values()):
-            return False
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_json(self.folder / ABOUT, self._about)
-        for name, file in self._files.items():
-            with (self.folder / name).open("wb") as copy:
-                for place in range(0, os.fstat(file.fileno()).st_size, 1 << 20):
-                    copy.write(os.pread(file.fileno(), 1 << 20, place))
-        return True
-
     def close(self) -> None:
         """Write what the encoders still hold, and close all files. Idempotent.
 

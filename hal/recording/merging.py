@@ -37,7 +37,6 @@ from .layout import (
     DatasetLayout,
     EpisodePlace,
     building_folder,
-    finish_replacement,
     lock_dataset,
     put_in_place,
     require_libraries,
@@ -82,7 +81,6 @@ def merge(
         OSError: The disk refuses.
     """
     require_libraries()
-    finish_replacement(out)
     target = DatasetLayout(Path(out).expanduser().resolve())  # not through a link: folders beside it are renamed
     folders = [part.root if isinstance(part, Dataset) else part for part in parts]
     layouts = [DatasetLayout(Path(folder).expanduser().resolve()) for folder in folders]

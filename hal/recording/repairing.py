@@ -25,7 +25,6 @@ from .finish import (
 from .index import merged_stats, stray_files, validated_info
 from .layout import (
     DatasetLayout,
-    finish_replacement,
     lock_dataset,
     read_json,
     require_libraries,
@@ -83,7 +82,6 @@ def repair(out: str | Path) -> list[str]:
 
 def _layout(out: str | Path) -> DatasetLayout:
     require_libraries()
-    finish_replacement(out)
     layout = DatasetLayout(out)
     if not layout.root.is_dir():
         raise CommandError(f"there is no folder {layout.root}", code="no_folder")

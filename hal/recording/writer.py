@@ -87,8 +87,7 @@ class EpisodeWriter:
             return
         self._checked_at = now
         if not self.live.in_place:
-            kept = self.live.rescue()
-            self._fail(f"{self.live.folder} is gone" + ("; the recorded rows were written there again" if kept else ""))
+            self._fail(f"{self.live.folder} is gone")
             return
         free = free_bytes(self.layout.root)
         self.queue.report(free_bytes=free)

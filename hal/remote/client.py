@@ -12,17 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from .. import registry
 from ..errors import ConnectionLost, HalError
 from ..host.process import Channel, ChannelClosed, SharedMemory, pack_error, unpack_error
 from ..host.records import GroupMemory
 from ..keys import Credentials, needs_keys
 from ..kinematics.composition import keep_urdf
-from ..specs import GroupSpec, RobotSpec, from_json
+from ..specs import CameraSpec, GroupSpec, RobotSpec, from_json
 from .boxes import boxes_of_hosts, boxes_of_program
 from .link import ANSWER_LIMIT, CLOSE_LIMIT, PORT, RigLink, describe_version
 
 PERIOD = 0.001
-"""Longest time from a new record of the program to its frame, s."""
+"""Longest time from a new record of the program to its frame, s. A command wakes this process."""
 
 
 def split_address(at: str) -> tuple[str, int]:
@@ -36,7 +37,7 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
 
     Args:
         at: Its address.
-        purpose: What the connection is for: ``{"want": "robots"}`` or ``{"want": "control", ...}``.
+        purpose: What the connection is for: ``{"want": "devices"}``, ``"control"`` or ``"frames"``.
 
     Raises:
         ConnectionLost: Nothing answers there (``code`` is ``no_server``); or a certificate is refused, see
@@ -54,7 +55,7 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
     if credentials is not None:
         sock = secured = credentials.wrap(sock, name)
         credentials.shake(secured, at)
-    link = RigLink(sock, at, PERIOD / 2.0)
+    link = RigLink(sock, at)
     try:
         if credentials is not None:
             link.check = partial(credentials.check, secured.getpeercert() or {}, at)
@@ -73,20 +74,23 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
     return link, answer
 
 
-def fetch_robots(at: str) -> dict[str, RobotSpec]:
-    """Return the arms that another computer serves, by name. Raises as :func:`connect`.
+def fetch_devices(at: str) -> dict[str, RobotSpec | CameraSpec]:
+    """Return the arms and cameras that another computer serves, by name. Raises as :func:`connect`.
 
     Their URDFs are those of this computer where they are the same, else copies in the user's cache; the meshes of
     these are missing.
     """
-    link, answer = connect(at, {"want": "robots"})
+    link, answer = connect(at, {"want": "devices"})
     link.close()
     files = {path: _place_urdf(path, text) for path, text in answer["urdfs"].items()}
-    found = {}
+    found: dict[str, RobotSpec | CameraSpec] = {}
     for data in answer["robots"]:
         spec = from_json(RobotSpec, data)
         kinematics = replace(spec.kinematics, urdf=files[spec.kinematics.urdf])
         found[spec.name] = replace(spec, at=at, urdf=files[spec.urdf], kinematics=kinematics)
+    for data in answer["cameras"]:
+        camera = from_json(CameraSpec, data)
+        found[camera.name] = replace(camera, at=at, driver=registry.SERVED)
     return found
 
 
@@ -103,12 +107,12 @@ def _place_urdf(path: str, text: str) -> str:
 class LinkClient:
     """The process in place of a host: it copies between the program's memory and a link, and passes requests on."""
 
-    def __init__(self, channel: Channel, memory: GroupMemory, spec: GroupSpec, realtime: bool) -> None:
+    def __init__(self, channel: Channel, memory: GroupMemory, spec: GroupSpec) -> None:
         assert spec.at is not None
         self._channel = channel
         self._parent = os.getppid()
         robots = [[robot.name, len(robot.joints)] for robot in spec.robots]
-        purpose = {"want": "control", "robots": robots, "grippers": list(memory.grippers), "realtime": realtime}
+        purpose = {"want": "control", "robots": robots, "grippers": list(memory.grippers)}
         self._link, _ = connect(spec.at, purpose)
         self._link.outgoing = boxes_of_program([memory], memory.robots, memory.grippers)
         self._link.incoming = boxes_of_hosts([memory], memory.robots, memory.grippers)
@@ -149,4 +153,4 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     """Run the child process of a group at another computer."""
     spec = from_json(GroupSpec, config["group"])
     memory = GroupMemory.of(memories[0].buffer, spec)
-    LinkClient(channel, memory, spec, bool(config.get("realtime", False))).run()
+    LinkClient(channel, memory, spec).run()

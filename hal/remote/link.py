@@ -121,7 +121,7 @@ class RigLink:
         period: Shortest time between two frames that have only records, s.
     """
 
-    def __init__(self, sock: socket.socket, at: str, period: float) -> None:
+    def __init__(self, sock: socket.socket, at: str, period: float = 0.0) -> None:
         self.at = at
         self.offset = ClockOffset()
         self.outgoing: Sequence[Box] = ()
@@ -130,6 +130,10 @@ class RigLink:
         """What takes the records that come, in the order of the other end's :attr:`outgoing`."""
         self.frames = 0
         """Number of the newest frame that was sent."""
+        self.largest = _LARGEST
+        """Size of the largest frame that is taken, bytes."""
+        self.took = 0.0
+        """How long the connection took the newest frame with something new, s."""
         self.check: Callable[[], object] = lambda: None
         """Raises ConnectionLost when the other end's certificate is no longer valid; called once in a second."""
         self._t_check = -math.inf
@@ -139,11 +143,14 @@ class RigLink:
         sock.setblocking(False)
         self._period = period
         self._messages: deque[Any] = deque()
-        self._unsent = b""
+        self._kept: list[Any] = []
+        """Messages that came together with the one that was awaited."""
+        self._unsent = memoryview(b"")
         self._buffer = bytearray()
         self._sent: list[int] = []
         """Numbers of the records that were sent last."""
         self._t_sent = -math.inf
+        self._timed = False
         self._newest = 0
         """Number of the newest frame that came."""
         self._heard = (math.nan, math.nan)
@@ -177,10 +184,14 @@ class RigLink:
         """
         self._read()
         now = time.monotonic()
-        messages, records = [], None
+        messages, self._kept = self._kept, []
+        records: list[tuple[int, bytes]] = []
         try:
             while (body := self._take_frame(now)) is not None:
-                records, message = self._split(body)
+                newest, message = self._split(body)
+                if records and newest:  # a picture is in one frame only
+                    newest = [new if new[1] else old for old, new in zip(records, newest, strict=True)]
+                records = newest or records
                 if message:
                     messages.append(json.loads(message))
             if records and self.incoming and self.offset.known:
@@ -198,8 +209,8 @@ class RigLink:
 
     def _read(self) -> None:
         try:
-            while len(self._buffer) < _LARGEST:
-                data = self._sock.recv(1 << 16)
+            while len(self._buffer) < self.largest:
+                data = self._sock.recv(1 << 18)
                 if not data:
                     raise ConnectionLost(f"{self.at} closed the connection", code="link_closed")
                 self._buffer += data
@@ -214,7 +225,7 @@ class RigLink:
         """Return the rest of the next frame that is newer than those before; None if it is not there yet."""
         while len(self._buffer) >= _HEADER.size:
             length, number, sent, heard, heard_at = _HEADER.unpack_from(self._buffer)
-            if length > _LARGEST:
+            if length > self.largest:
                 raise ValueError(f"a frame of {length} bytes")
             end = _HEADER.size + length
             if len(self._buffer) < end:
@@ -259,9 +270,11 @@ class RigLink:
             parts += (_ITEM.pack(number, len(record)), record)
         parts.append(message)
         self.frames += 1
+        self._timed = numbers != self._sent
         self._sent, self._t_sent = numbers, now
         length = sum(map(len, parts))
-        self._unsent = b"".join((_HEADER.pack(length, self.frames, time.monotonic(), *self._heard), *parts))
+        head = _HEADER.pack(length, self.frames, time.monotonic(), *self._heard)
+        self._unsent = memoryview(b"".join((head, *parts)))
         self._flush()
 
     def _flush(self) -> bool:
@@ -269,6 +282,8 @@ class RigLink:
         try:
             while self._unsent:
                 self._unsent = self._unsent[self._sock.send(self._unsent) :]
+                if self._timed:
+                    self.took = time.monotonic() - self._t_sent
         except (BlockingIOError, ssl.SSLWantWriteError):
             pass
         except OSError as error:
@@ -287,6 +302,7 @@ class RigLink:
             self.wait(_IDLE)
             messages = self.receive()
             if messages:
+                self._kept = messages[1:]
                 return messages[0]
         raise ConnectionLost(f"{self.at} did not answer within {timeout:g} s", code="no_answer")
 
@@ -295,6 +311,12 @@ class RigLink:
         self.post(message)
         with contextlib.suppress(ConnectionLost):
             self.await_message()
+
+    def statistics(self) -> dict[str, Any]:
+        """Return the round trips and the offset of the clocks, s, and the number of frames that were sent."""
+        offset = self.offset
+        found = {"round_trip_s": offset.round_trip, "offset_s": offset.value, "frames": self.frames}
+        return {**found, "round_trips_s": offset.round_trips.summary()}
 
     def close(self) -> None:
         """Close the connection. Idempotent."""

@@ -1,27 +1,34 @@
-"""The end of a link at the devices: it opens them for one client at a time, and closes them when that one leaves."""
+"""The end of a link at the devices: it lends those of an open rig to clients, each arm to one at a time."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import threading
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..commands import Session
+from ..commands import NO_SESSION, DeadmanRecord, Session
 from ..errors import CommandError, ConnectionLost, ControlTaken, HalError, NotSupported
-from ..host.hosts import RemoteHost, make_groups, start_processes
-from ..host.process import pack_error
+from ..host.hosts import RemoteHost
+from ..host.process import STOP_LIMIT, pack_error
 from ..host.records import GripperMail, RobotMail
-from ..specs import Plan, RobotSpec, to_json
+from ..servo.watchdog import SILENCE
+from ..specs import CameraSpec, Plan, RobotSpec, to_json
 from .boxes import boxes_of_hosts, boxes_of_program
 from .entrance import Entrance
+from .frames import send_frames
 from .link import CLOSE_LIMIT, MOST_ROUND_TRIP, RigLink, describe_version
 from .measure import echo
+
+if TYPE_CHECKING:
+    from ..rig import Rig
 
 PERIOD = 0.002
 """Longest time from a new state to its frame, s."""
@@ -30,67 +37,77 @@ _LEAVING = 1.0
 
 
 class Served:
-    """The hosts of a rig, open for one client: what it writes reaches them, and what they publish reaches it.
+    """Groups of a rig, lent to a client: what it writes reaches them, and what they publish reaches it.
 
     Args:
-        plan: The rig.
+        hosts: The groups.
         link: The connection.
         wish: What the client wants: names of its arms, each with the number of joints, and of its grippers.
         over: Set when the server ends.
     """
 
-    def __init__(self, plan: Plan, link: RigLink, wish: dict[str, Any], over: threading.Event) -> None:
+    def __init__(self, hosts: Sequence[RemoteHost], link: RigLink, wish: dict[str, Any], over: threading.Event) -> None:
         self._over = over
-        self._plan = plan
         self.link = link
-        self._wish = wish
-        self.hosts: list[RemoteHost] = []
-        self._robots = {robot.name: robot for robot in plan.robots}
+        self.hosts = hosts
+        self._robots = {robot.name: robot for host in hosts for robot in host.spec.robots}
+        robots = {name: self._find_robot(name, n) for name, n in wish["robots"]}
+        grippers = {name: self._find_gripper(name) for name in wish["grippers"]}
+        memories = [host.memory for host in hosts]
+        ahead = {name: self._robots[name].deadline_max for name in robots}
+        link.incoming = boxes_of_program(memories, robots, grippers, ahead)
+        link.outgoing = boxes_of_hosts(memories, robots, grippers)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="hal-serve-request")  # one request at a time
-        self._failure: BaseException | None = None
 
     def run(self) -> None:
-        """Open the devices, copy until the client leaves or is gone, bring the arms to rest and close the devices."""
+        """Copy until the client leaves or is gone; bring the arms to rest."""
         link = self.link
-        closing: threading.Thread | None = None
         try:
-            self._start()
-            while closing is None or closing.is_alive():
-                link.wait(PERIOD)
-                for message in link.receive():
-                    if message["method"] != "close":
-                        self._worker.submit(self._answer, message)
-                    elif closing is None:  # the arms come to rest while their states are still copied
-                        closing = threading.Thread(target=self._close, name="hal-serve-close")
-                        closing.start()
-                link.send()
-                if closing is None:
-                    self._check()
+            for host in self.hosts:
+                host.lend(True)
+            link.post({"ready": {"realtime": all(host.child.ready["realtime"] for host in self.hosts)}})
+            self._copy()
+            self._take_back()
             link.say_last({"closed": True})
         except BaseException as error:
-            for host in self.hosts:
-                host.request_close()
+            self._take_back()
             link.say_last({"error": pack_error(error)})
             raise
         finally:
-            if closing is not None:
-                closing.join()
-            self._close()
             self._worker.shutdown(wait=True)
 
-    def _start(self) -> None:
-        """Start the hosts, and answer when they are ready; a client without a heartbeat moves nothing meanwhile."""
-        realtime = bool(self._wish["realtime"])
-        for host in start_processes(make_groups(self._plan), realtime, beating=False):
-            self.hosts.append(host)
-            self.link.send()  # the client waits for a sign of life
-        robots = {name: self._find_robot(name, n) for name, n in self._wish["robots"]}
-        grippers = {name: self._find_gripper(name) for name in self._wish["grippers"]}
-        memories = [host.memory for host in self.hosts]
-        ahead = {name: self._robots[name].deadline_max for name in robots}
-        self.link.incoming = boxes_of_program(memories, robots, grippers, ahead)
-        self.link.outgoing = boxes_of_hosts(memories, robots, grippers)
-        self._worker.submit(self._wait_ready)
+    def _copy(self) -> None:
+        link = self.link
+        while True:
+            link.wait(PERIOD)
+            for message in link.receive():
+                if message["method"] == "close":
+                    return
+                self._worker.submit(self._answer, message)
+            link.send()
+            if self._over.is_set():
+                raise ConnectionLost("the server was ended", code="server_ended")
+            for host in self.hosts:
+                host.child.check()
+
+    def _take_back(self) -> None:
+        """End what the client began.
+
+        Its arms come to rest before there is another sign of life, and its grippers stop for the lack of one.
+        """
+        self.link.incoming = self.link.outgoing = ()  # the end of its sessions is not news for it, the reason is
+        arms = [mail for host in self.hosts for mail in host.memory.robots.values()]
+        for mail in arms:
+            mail.put_session(NO_SESSION)
+            mail.put_deadman(DeadmanRecord(False, False, 0, -math.inf))
+        time.sleep(2.0 * SILENCE)
+        deadline = time.monotonic() + STOP_LIMIT
+        while any((servo := mail.peek()) is not None and servo.session for mail in arms):
+            if time.monotonic() > deadline:  # a device that does not answer: no session is opened meanwhile
+                break
+            time.sleep(PERIOD)
+        for host in self.hosts:
+            host.lend(False)
 
     def _find_robot(self, name: str, n: int) -> RobotMail:
         spec = self._robots.get(name)
@@ -103,22 +120,6 @@ class Served:
         if not found:
             raise NotSupported(f"no gripper {name!r} is served here", code="no_gripper")
         return found[0]
-
-    def _wait_ready(self) -> None:
-        try:
-            ready = [host.wait_ready() for host in self.hosts]
-            self.link.post({"ready": {"realtime": all(answer["realtime"] for answer in ready)}})
-        except BaseException as error:
-            self._failure = error
-
-    def _check(self) -> None:
-        """Raise the error with which a host ended, or if the server ends."""
-        if self._over.is_set():
-            raise ConnectionLost("the server was ended", code="server_ended")
-        if self._failure is not None:
-            raise self._failure
-        for host in self.hosts:
-            host.child.check()
 
     # Requests.
 
@@ -133,8 +134,6 @@ class Served:
     def _request(self, method: str, params: dict[str, Any]) -> Any:
         if method in ("warnings", "reset_statistics", "statistics"):
             results = [host.request(method) for host in self.hosts]
-            if method == "reset_statistics":
-                self.link.offset.forget_round_trips()
             if method == "warnings":
                 return [text for result in results for text in result]
             return self._merge_statistics(results) if method == "statistics" else None
@@ -165,24 +164,15 @@ class Served:
         merged = dict(results[0])
         for key in ("robots", "grippers"):
             merged[key] = {name: value for result in results for name, value in result[key].items()}
-        offset = self.link.offset
-        merged["link"] = {"round_trip_s": offset.round_trip, "offset_s": offset.value, "frames": self.link.frames}
-        merged["link"]["round_trips_s"] = offset.round_trips.summary()
+        merged["link"] = self.link.statistics()
         return merged
-
-    def _close(self) -> None:
-        """Bring the arms to rest and close the devices; the processes at the same time."""
-        for host in self.hosts:
-            host.request_close()
-        for host in self.hosts:
-            host.close()
 
 
 class Server:
-    """Listens for clients, and serves one at a time.
+    """Listens for clients, and lends the devices of a rig to them: each arm to one at a time, cameras to any number.
 
     Args:
-        plan: The rig, in real time. Its cameras and pads are not served.
+        rig: The open rig, in real time.
         address: Address to listen at.
         port: Port; 0 for a free one.
         report: Called with each line that a user should see.
@@ -190,24 +180,19 @@ class Server:
     Raises:
         NotSupported: An address other than 127.0.0.1, ::1 and localhost without a certificate (``code`` is
             ``no_certificates``, or see :func:`~hal.keys.find_key`), or a rig in lock-step (``needs_real_time``).
-        CommandError: There is no arm (``code`` is ``no_robot``), or the port is taken (``bad_address``).
+        CommandError: There is nothing to serve (``code`` is ``no_devices``), or the port is taken (``bad_address``).
     """
 
-    def __init__(self, plan: Plan, address: str, port: int, report: Callable[[str], object]) -> None:
+    def __init__(self, rig: Rig, address: str, port: int, report: Callable[[str], object]) -> None:
         self.entrance = Entrance(address, report)
-        if plan.clock == "lock_step":
-            raise NotSupported("a served rig needs real time; leave out the clock lock_step", code="needs_real_time")
-        far = [robot.name for robot in plan.robots if robot.at is not None]
-        if far:
-            raise NotSupported(f"{far[0]} is served by another computer: name that one in the rig", code="served_twice")
-        if not plan.robots:
-            raise CommandError(f"{plan.source} has no robot to serve", code="no_robot")
-        self._plan = replace(plan, cameras=(), pads=())
+        check_servable(rig.plan)
+        self._rig = rig
+        self._hosts = [host for host in rig._hosts if isinstance(host, RemoteHost)]
         self._report = report
-        self._lease = threading.Lock()
+        self._leases = threading.Condition()
         self._over = threading.Event()
-        self.served: Served | None = None
-        """The devices of the client that has them; None while there is none."""
+        self.served: list[Served] = []
+        """What is lent at present."""
         try:
             self._socket = socket.create_server(
                 (address, port), family=socket.AF_INET6 if ":" in address else socket.AF_INET
@@ -226,12 +211,21 @@ class Server:
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def run(self) -> None:
-        """Serve until :meth:`close`, or until an exception, such as Ctrl-C, ends it. The devices are closed first."""
+        """Serve until :meth:`close`, or until an exception, such as Ctrl-C, ends it.
+
+        Raises:
+            ConnectionLost: A process that owns devices is gone.
+        """
         threads: list[threading.Thread] = []
+        self._socket.settimeout(_LEAVING)
         try:
             while not self._over.is_set():
+                for host in self._hosts:
+                    host.child.check()
                 try:
                     sock, peer = self._socket.accept()
+                except TimeoutError:
+                    continue
                 except OSError:
                     if self._over.is_set():
                         return
@@ -263,36 +257,70 @@ class Server:
                 link.close()
 
     def _serve(self, link: RigLink, peer: str, wish: dict[str, Any]) -> None:
+        want = wish["want"]
         try:
             check_version(wish)
-            if wish["want"] == "robots":
-                link.say_last(describe_robots(self._plan.robots))
+            if want == "devices":
+                link.say_last(describe_devices(self._rig.plan))
                 return
-            if wish["want"] == "echo":
+            if want == "echo":
                 echo(link, self._over)
                 return
-            self._take()
+            if want != "frames":
+                served = self._lend(link, wish)
         except HalError as error:
             link.say_last({"error": pack_error(error)})
             raise
+        self.entrance.leave(peer)
         try:
-            self.entrance.leave(peer)
-            link.post({"accepted": True})
-            self._report(f"{link.at} has taken {', '.join(name for name, _ in wish['robots'])}")
-            self.served = Served(self._plan, link, wish, self._over)
-            self.served.run()
+            if want == "frames":
+                send_frames(self._rig.cameras[wish["camera"]], link, self._over)
+            else:
+                self._run(served, ", ".join(name for name, _ in wish["robots"]))
         except ConnectionLost as error:
             self._report(f"{link.at}: {error}")
-        finally:
-            self.served = None
-            self._lease.release()
-            self._report(f"{link.at} has left; the devices are closed")
+            if want == "frames":
+                link.say_last({"error": pack_error(error)})
 
-    def _take(self) -> None:
-        """Take the lease. Raises ControlTaken while another connection has it."""
-        if not self._lease.acquire(timeout=_LEAVING):
-            owner = self.served.link.at if self.served is not None else "another program"
-            raise ControlTaken(f"this rig is in use by {owner}", code="in_use")
+    def _run(self, served: Served, names: str) -> None:
+        at = served.link.at
+        try:
+            served.link.post({"accepted": True})
+            self._report(f"{at} has taken {names}")
+            served.run()
+        finally:
+            with self._leases:
+                self.served.remove(served)
+                self._leases.notify_all()
+            self._report(f"{at} has left")
+
+    def _lend(self, link: RigLink, wish: dict[str, Any]) -> Served:
+        """Lend the groups of a client's devices. Raises ControlTaken while another client has one of them."""
+        names = {*(name for name, _ in wish["robots"]), *wish["grippers"]}
+        hosts = [host for host in self._hosts if names & {*host.memory.robots, *host.memory.grippers}]
+
+        def owners() -> list[str]:
+            return [served.link.at for served in self.served if not set(hosts).isdisjoint(served.hosts)]
+
+        with self._leases:
+            if not self._leases.wait_for(lambda: not owners(), _LEAVING):
+                raise ControlTaken(f"this rig is in use by {owners()[0]}", code="in_use")
+            self.served.append(Served(hosts, link, wish, self._over))
+            return self.served[-1]
+
+
+def check_servable(plan: Plan) -> None:
+    """Raise NotSupported or CommandError for a rig that cannot be served, as :class:`Server`."""
+    if plan.clock == "lock_step":
+        raise NotSupported("a served rig needs real time; leave out the clock lock_step", code="needs_real_time")
+    devices: tuple[RobotSpec | CameraSpec, ...] = (*plan.robots, *plan.cameras)
+    for device in devices:
+        if device.at is not None:
+            raise NotSupported(
+                f"{device.name} is served by another computer: name that one in the rig", code="served_twice"
+            )
+    if not devices:
+        raise CommandError(f"{plan.source} has no arm or camera to serve", code="no_devices")
 
 
 def check_version(wish: dict[str, Any]) -> None:
@@ -305,14 +333,15 @@ def check_version(wish: dict[str, Any]) -> None:
         raise NotSupported(text + layouts, code="version_mismatch")
 
 
-def describe_robots(robots: tuple[RobotSpec, ...]) -> dict[str, Any]:
-    """Return the records of arms and the text of their URDFs, without the options of the drivers."""
+def describe_devices(plan: Plan) -> dict[str, Any]:
+    """Return the records of arms and cameras and the text of the arms' URDFs, without the options of the drivers."""
     public = [
         replace(robot, options={}, gripper=None if robot.gripper is None else replace(robot.gripper, options={}))
-        for robot in robots
+        for robot in plan.robots
     ]
-    files = {path for robot in robots for path in (robot.urdf, robot.kinematics.urdf)}
+    files = {path for robot in public for path in (robot.urdf, robot.kinematics.urdf)}
     return {
         "robots": [to_json(robot) for robot in public],
+        "cameras": [to_json(replace(camera, options={})) for camera in plan.cameras],
         "urdfs": {path: Path(path).read_text(encoding="utf-8") for path in sorted(files)},
     }

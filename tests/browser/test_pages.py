@@ -83,33 +83,6 @@ def test_the_cameras_show_what_happens() -> None:
         bench.close()
 
 
-def test_the_3d_view_is_on_the_page_and_the_keys_stay_with_the_page(browser: Browser) -> None:
-    """Without a GPU the camera is large at first, and a click opens the 3D view; here it then finds no WebGL at all."""
-    pytest.importorskip("viser")
-    bench = Bench(cameras=True, viewer="3d")
-    frame = "document.querySelector('.stage iframe')"
-    without = "if (self !== top) HTMLCanvasElement.prototype.getContext = () => null"
-    script = browser.cdp("Page.addScriptToEvaluateOnNewDocument", source=without)["identifier"]
-    try:
-        browser.size(1280, 800)
-        browser.open(bench.link)
-        browser.wait_driving()
-        assert browser.run("return document.querySelector('.camera.large canvas') !== null"), "there is no GPU here"
-        assert not browser.run(f"return {frame}.src")
-        browser.click(".stage")
-        wait_for(lambda: browser.run(f"return {frame}.contentDocument.title === 'Viser'"), "the 3D view")
-        wait_for(lambda: browser.run(f"return {frame}.contentDocument.readyState") == "complete", "all of it")
-        browser.click(".stage iframe")
-        assert browser.run("return document.activeElement === document.body && document.hasFocus()")
-        browser.run(f"{frame}.focus()")
-        wait_for(lambda: browser.run("return document.activeElement === document.body"), "the focus to come back")
-        browser.complaints()  # viser misses WebGL
-    finally:
-        browser.cdp("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
-        browser.chrome.get("about:blank")
-        bench.close()
-
-
 SIZES = [
     (1280, 800, False),
     (1920, 1080, False),

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import hal
 from hal import registry
 from hal.clock import LockStepClock, RealClock
 from hal.drivers.mock.camera import MockCamera
 from hal.drivers.mock.robot import MockGripper, MockRobot
+from hal.drivers.served.camera import ServedCamera
+from hal.remote.client import fetch_devices
+from hal.remote.server import Server
 from hal.specs import BodySpec, CameraSpec, GroupSpec, ViewSpec, WorldSpec
 from hal.testing import CameraBench, GripperBench, RobotBench, WorldBench, camera_spec, gripper_spec, robot_spec
 
@@ -119,6 +125,44 @@ def mock_camera() -> Iterator[CameraBench]:
     driver = MockCamera(camera_spec(capture_width=128, capture_height=96, rate_hz=60.0), clock)
     yield CameraBench(driver=driver, clock=clock, patience=1.0, **links(driver))
     driver.close()
+
+
+class CameraComputer:
+    """A computer with a mock camera that it serves, in this process."""
+
+    def __init__(self) -> None:
+        model = {"model": "pinhole", "capture": {"width": 128, "height": 96, "rate_hz": 60.0}}
+        rig = {"robots": {}, "cameras": {"scene": {**model, "streams": ["color", "depth"]}}}
+        self.rig = hal.open(rig, driver="mock", clock="real_time", pad="none")
+        self.port = 0
+        self.start()
+
+    def start(self) -> None:
+        """Serve at the port of the last time."""
+        self._server = Server(self.rig, "127.0.0.1", self.port, lambda line: None)
+        self.port = self._server.port
+        self._thread = threading.Thread(target=self._server.run)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the server and its connections."""
+        self._server.close()
+        self._thread.join()
+
+    def close(self) -> None:
+        self.stop()
+        self.rig.close()
+
+
+@contextmanager
+def served_camera() -> Iterator[CameraBench]:
+    computer = CameraComputer()
+    spec = fetch_devices(f"127.0.0.1:{computer.port}")["scene"]
+    driver = ServedCamera(spec)
+    freeze = partial(computer.rig.driver("scene").inject, freeze=True)
+    yield CameraBench(driver=driver, patience=2.0, lose=computer.stop, restore=computer.start, freeze=freeze)
+    driver.close()
+    computer.close()
 
 
 @contextmanager

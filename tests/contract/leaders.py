@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from unittest.mock import patch
 
 from servo_bus_kit import SteppedServos, so101_leader
 
 from hal.config import load
 from hal.drivers.mock.leader import MockLeader
+from hal.drivers.servo_bus import bus
 from hal.testing import PadBench
 
 
@@ -27,11 +29,16 @@ def mock_leader() -> Iterator[PadBench]:
 @contextmanager
 def feetech_leader() -> Iterator[PadBench]:
     """An emulated SO-101, whose motors have no torque."""
-    with SteppedServos() as far, closing(so101_leader(far)) as driver:
+    with SteppedServos() as far, closing(so101_leader(far)) as driver, ExitStack() as stack:
+
+        def freeze() -> None:
+            far.execute("silent all on")
+            stack.enter_context(patch.object(bus, "_ANSWER", 0.02))  # no answer comes: nobody has to wait for it long
+
         yield PadBench(
             driver=driver,
             advance=lambda: far.advance(0.01),
             lose=lambda: far.execute("unplug on") and None,
             restore=lambda: far.execute("unplug off") and None,
-            freeze=lambda: far.execute("silent all on") and None,
+            freeze=freeze,
         )

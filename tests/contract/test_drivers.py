@@ -34,6 +34,7 @@ from .benches import (
     played_realsense,
     pybullet_camera_in_lock_step,
     recording,
+    served_camera,
     simulated_gripper,
     simulated_robot,
     simulated_world,
@@ -305,6 +306,12 @@ class TestVideoFile(CameraContract, left_out=dict.fromkeys(("lose", "restore", "
 
 class TestNetworkCamera(CameraContract):
     bench = bench_of(network_camera)
+
+
+class TestServedCamera(CameraContract):
+    """A camera of another computer, through ``hal serve``."""
+
+    bench = bench_of(served_camera)
 
 
 @pytest.mark.slow

@@ -15,11 +15,14 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
+from app_kit import Done, run_here
 from recording_kit import small
 
 import hal
+from hal.apps.main import main
 from hal.config.data_files import find_data
 from hal.config.mapping import load_mapping
 from hal.errors import ConfigError
@@ -38,6 +41,7 @@ EPISODES = 10
 HANG = 600
 """s after which a program counts as hanging. It ends by itself: a busy computer only makes it slower."""
 
+PROGRAM = ["-m", "hal.apps.main"]
 NOT_RUN = {
     "pip": "would change the environment; tests/packaging installs the wheel",
     "pytest": "this is it",
@@ -139,15 +143,19 @@ class Reader:
             if arguments is None:
                 assert words[0] in NOT_RUN or words[0].startswith(".ci/"), f"{block}: no way to run {part!r}"
                 continue
-            environment = {**os.environ, "PYTHONPATH": str(self.folder)}
-            done = subprocess.run(
-                [sys.executable, *arguments],
-                cwd=self.folder,
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=HANG,
-            )
+            done: Done | subprocess.CompletedProcess[str]
+            if arguments[:2] == PROGRAM:  # tests/apps starts each as a program of its own
+                with mock.patch.object(hal, "open", self._open):
+                    done = run_here(main, *arguments[2:])
+            else:
+                done = subprocess.run(
+                    [sys.executable, *arguments],
+                    cwd=self.folder,
+                    env={**os.environ, "PYTHONPATH": str(self.folder)},
+                    capture_output=True,
+                    text=True,
+                    timeout=HANG,
+                )
             output = (done.stdout + done.stderr).strip()
             wrong = any("Error" in line for line in shown)
             assert (done.returncode != 0) == wrong, f"{block}: {part!r} ended with {done.returncode}:\n{output}"
@@ -158,7 +166,7 @@ class Reader:
         """What Python is to be started with; None for a command that is not run here."""
         if words[0] == "pytest" and any(word.endswith(".py") for word in words):
             return ["-m", "pytest", "-p", "no:cacheprovider", *words[1:]]
-        start = ["-m", "hal.apps.main"]
+        start = PROGRAM.copy()
         if words[0] == "hal":
             program, rest = words[1], words[2:]
             start.append(program)

@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     try:
         passed = [
-            _run(series, _job(options.k or ("" if options.kernel else usual)), options)
+            _run(series, _job(options.k or ("" if options.kernel else usual), options.seconds), options)
             for series, usual in _SERIES.items()
             if series in (options.kernel or _SERIES)
         ]
@@ -53,6 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     add("-k", metavar="EXPRESSION", default="", help="only the checks whose names match, as pytest's -k")
     add("--refresh", action="store_true", help="download the newest kernels, though there are some in the cache")
     add("--limit", type=float, default=480.0, help="end a machine after so many seconds (default: %(default)g)")
+    add("--seconds", type=float, default=5.0, help="length of the long run of a webcam (default: %(default)g)")
     add("--console", action="store_true", help="show what each machine's kernel and pytest said, too")
     return parser
 
@@ -61,7 +62,7 @@ def _run(series: str, job: str, options: argparse.Namespace) -> bool:
     """All checks on one kernel; True when they passed."""
     image = image_for(series, options.refresh, partial(print, flush=True))
     print(f"\n{image.name}", flush=True)
-    machine = Machine(image, job, options.limit)
+    machine = Machine(image, job, options.limit + options.seconds)
     passed: list[bool] = []
     status = None
     with closing(machine.lines()) as lines:
@@ -87,7 +88,7 @@ def _run(series: str, job: str, options: argparse.Namespace) -> bool:
     return status == 0 and bool(passed) and all(passed)
 
 
-def _job(expression: str) -> str:
+def _job(expression: str, seconds: float) -> str:
     """What a machine does: pytest, with this interpreter, on this checkout. Raises Missing."""
     guest = _HERE / "guest"
     environment = {
@@ -99,6 +100,7 @@ def _job(expression: str) -> str:
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         "HAL_KERNEL_PAD": json.dumps(_pad()),
         "HAL_KERNEL_RESULTS": "/dev/ttyS1",
+        "HAL_KERNEL_SECONDS": str(seconds),
     }
     pytest = [sys.executable, "-m", "pytest", "-c", guest / "checks.ini", "--rootdir", guest, "-k", expression, guest]
     exports = [f"export {name}={shlex.quote(value)}" for name, value in environment.items()]

@@ -60,12 +60,20 @@ def seed_of(number: int, draws: int = 0, seed: int = 0) -> int:
     return int(np.random.SeedSequence([seed, number, draws]).generate_state(1)[0])
 
 
-def write_pad(folder: Path, *presses: tuple[float, str], until: float, held: tuple[float, float] | None = None) -> str:
-    """Write a recorded DualShock 4 on which buttons are tapped, at s; L2 is ``held`` from s to s. Return its path."""
+def write_pad(
+    folder: Path,
+    *presses: tuple[float, str] | tuple[float, str, float],
+    until: float,
+    held: tuple[float, float] | None = None,
+) -> str:
+    """Write a recorded DualShock 4 on which buttons are tapped, at s, or pressed for s; L2 is ``held`` from s to s.
+
+    Return its path.
+    """
     ranges = {axis: [0, 255, 15] for axis in ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY", "ABS_Z", "ABS_RZ")}
     header = {"format": "hal-pad-events", "version": 1, "model": "dualshock4", "ranges": ranges}
     events = [(0.0, axis, 0 if axis in ("ABS_Z", "ABS_RZ") else 128) for axis in ranges]
-    events += [(t + up * _TAP, button, 1 - up) for t, button in presses for up in (0, 1)]
+    events += [(t + up * (*how, _TAP)[0], button, 1 - up) for t, button, *how in presses for up in (0, 1)]
     if held is not None:
         events += [(t, code, value * down) for t, down in zip(held, (1, 0), strict=True) for code, value in _SQUEEZE]
     events.append((until, "ABS_X", 128))

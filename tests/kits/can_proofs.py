@@ -1,6 +1,6 @@
 """Proofs on an emulated CAN arm with gravity: at rest, on a recorded drive, after the end of its program.
 
-Each starts an emulator of its own, on a rig with one arm "arm". ``python -m benchmarks can`` prints long versions.
+Each starts an emulator of its own, on a rig with one arm "arm".
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +26,6 @@ _TELEOP = Path(__file__).resolve().parents[2] / "apps" / "teleop.py"
 SPEED = 0.4
 """Of the joint that moves when a program ends, rad/s."""
 _NO_TABLE = ("robots.arm.workspace=null", "collisions.boxes=[]")
-WAYS = ("app killed", "host killed", "bus cut")
 
 APP = """
 import json, os, sys
@@ -124,40 +122,6 @@ def tour(rig_name: str, pad: Path, folder: Path) -> Tour:
     ends = [Pose(report["tcp_end"]["position"], report["tcp_end"]["orientation"]) for report in reports]
     trips = [trip for report in reports for trip in (*report["trips"], *report["faults"])]
     return Tour(*ends[0].distance(ends[1]), reports[0]["tcp_travel_m"], trips)
-
-
-def tracking(rig_name: str, seconds: float = 8.0) -> list[float]:
-    """Return distances between the set-point's tcp and the plant's at the same time, m, in a motion of all axes."""
-    with (
-        EmulatorProcess(rig_name, *_NO_TABLE) as emulator,
-        hal.open(rig_name, sim=False, pad="none", overrides=emulator.overrides) as rig,
-    ):
-        arm = rig.robots["arm"]
-        chain = Kinematics(arm.spec.kinematics)
-        distances: list[float] = []
-        done = threading.Event()
-
-        def watch() -> None:
-            while not done.wait(0.01):
-                before = np.array(arm.state().q_set)
-                q = emulator.execute("state")["q"]
-                after = np.array(arm.state().q_set)
-                distances.append(chain.pose(q).distance(chain.pose(0.5 * (before + after)))[0])
-
-        arm.move_to(arm.home, speed=0.5, unattended=True)
-        with arm.control(rate_hz=50, unattended=True) as control:
-            thread = threading.Thread(target=watch)
-            thread.start()
-            start = rig.clock.now()
-            for tick in rig.clock.rate(50):
-                t = tick.t - start
-                x, y, z = 0.15 * np.cos(1.3 * t), 0.15 * np.cos(1.7 * t), 0.12 * np.cos(2.1 * t)
-                control.send(hal.Twist([x, y, z], [0.0, 0.0, 0.3 * np.cos(t)]))
-                if t > seconds:
-                    break
-            done.set()
-            thread.join()
-    return distances
 
 
 class End(NamedTuple):

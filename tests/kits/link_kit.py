@@ -17,7 +17,7 @@ from typing import Any
 
 from waiting import wait_until
 
-from hal.config import load
+import hal
 from hal.host.records import RobotMail, ServoRecord
 from hal.remote.server import Server
 
@@ -61,10 +61,11 @@ with hal.open({"robots": {"panda": {"at": sys.argv[1]}}}, pad="none") as rig:
 _HEADER = struct.Struct("<IQddd")
 
 
-def start_server(listen: str = "127.0.0.1:0") -> tuple[subprocess.Popen[str], str]:
-    """Start ``hal serve --sim``; return its process and its address."""
+def start_server(*overrides: str, listen: str = "127.0.0.1:0") -> tuple[subprocess.Popen[str], str]:
+    """Start ``hal serve --sim``, without cameras unless it is overridden; return its process and its address."""
     run = [sys.executable, str(ROOT / "apps" / "serve.py"), "--sim", "--listen", listen]
-    server = subprocess.Popen([*run, "--set", "cameras={}"], stdout=subprocess.PIPE, text=True)
+    run += [word for override in overrides or ["cameras={}"] for word in ("--set", override)]
+    server = subprocess.Popen(run, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
     line = next(line for line in server.stdout if line.startswith("listening at "))
     return server, line.removeprefix("listening at ").partition(",")[0]
@@ -206,8 +207,8 @@ def _has_message(frame: bytes) -> bool:
 class Bench:
     """A served mock arm, and a proxy before it."""
 
-    def __init__(self, server: Server) -> None:
-        self.server = server
+    def __init__(self, rig: hal.Rig, server: Server) -> None:
+        self.rig, self.server = rig, server
         self.proxy = Proxy(server.port)
         self.programs: list[DrivingProgram] = []
 
@@ -220,8 +221,7 @@ class Bench:
     @property
     def mail(self) -> RobotMail:
         """The mailboxes of the arm, at its own host."""
-        assert self.server.served is not None
-        return self.server.served.hosts[0].memory.robots["panda"]
+        return self.rig.robots["panda"]._mail
 
     def servo(self) -> ServoRecord:
         """Return the newest state of the servo."""
@@ -231,24 +231,24 @@ class Bench:
 
     def speed(self) -> float:
         """Return the speed of the first joint's set-point, rad/s."""
-        return abs(self.servo().dq_set[0]) if self.server.served is not None and self.mail.state.seq() else 0.0
+        return abs(self.servo().dq_set[0])
 
 
 @contextmanager
 def served_arm() -> Iterator[Bench]:
     """Serve a mock arm; close everything in the end."""
     overrides = {"cameras": {}, "gamepads": {}, "objects": []}
-    plan = load("panda_table", driver="mock", clock="real_time", overrides=overrides).resolve()
-    server = Server(plan, "127.0.0.1", 0, lambda line: None)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    bench = Bench(server)
-    try:
-        yield bench
-    finally:
-        for program in bench.programs:
-            program.process.kill()
-            program.process.wait()
-        server.close()
-        thread.join()
-        bench.proxy.close()
+    with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=overrides) as rig:
+        server = Server(rig, "127.0.0.1", 0, lambda line: None)
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        bench = Bench(rig, server)
+        try:
+            yield bench
+        finally:
+            for program in bench.programs:
+                program.process.kill()
+                program.process.wait()
+            server.close()
+            thread.join()
+            bench.proxy.close()

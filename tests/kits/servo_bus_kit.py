@@ -15,7 +15,7 @@ from unittest.mock import patch
 
 from hal.config import load
 from hal.drivers.servo_bus import bus
-from hal.drivers.servo_bus.leader import FeetechLeader
+from hal.drivers.servo_bus.leader import ServoLeader
 from hal.specs import RobotSpec
 from hal_emulators.control import EmulatorControl
 from hal_emulators.servo_bus import servo
@@ -66,10 +66,10 @@ class SteppedServos(ServoBusEmulator):
             part.stop()
 
 
-def so101_leader(emulator: SteppedServos) -> FeetechLeader:
-    """Return the driver of a leader whose motors are those of an emulated arm."""
-    rig = {"leaders": {"lead": {"model": "so101_leader", "port": emulator.arm.port}}}
-    return FeetechLeader(load(rig).resolve().pads[0])
+def so101_leader(emulator: SteppedServos, **entry: Any) -> ServoLeader:
+    """Return the driver of a leader whose motors are those of an emulated arm; ``entry`` has more of its entry."""
+    leader = {"model": "so101_leader", "port": emulator.arm.port, **entry}
+    return ServoLeader(load({"leaders": {"lead": leader}}).resolve().pads[0])
 
 
 class ServoBusProcess:

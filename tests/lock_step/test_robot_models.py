@@ -41,8 +41,9 @@ def test_a_model_drives_closes_its_gripper_and_stays_where_a_reset_put_it(
     with installed():
         rig = robots.open_model(entry, engine.name)
     with rig:
-        found = robots.drive_model(rig, poses=10, tour=0.1)
+        found = robots.drive_model(rig, poses=10, tour=0.05)
         assert found.found == 10
+        assert found.moved > 0.05
         assert found.position <= 1e-5
         assert found.trip is Trip.NONE
         assert found.lag < 0.01
@@ -69,7 +70,7 @@ def test_a_hand_whose_fingers_are_cut_into_slices_needs_no_scipy() -> None:
 def check_that_it_stays(rig: hal.Rig) -> None:
     """Without torques, from the first step on: what the motors left undone in it would be a speed of the arm."""
     arm, rng, room = rig.robots["arm"], np.random.default_rng(2), 0.05
-    for _ in range(3):
+    for _ in range(2):
         q = arm.home + rng.uniform(-0.3, 0.3, arm.n)
         rig.world.reset("arm", q=np.clip(q, np.add(arm.limits.lower, room), np.subtract(arm.limits.upper, room)))
         start = arm.state().q

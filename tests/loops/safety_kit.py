@@ -32,7 +32,11 @@ ELSEWHERE = {
         f"{ARMS}independent_arms_do_not_stop_each_other",
     ),
     "your loop is too slow or hangs": (f"{SYSTEM}ends.py::test_user_code_that_goes_wrong",),
-    "the app is killed": (f"{SYSTEM}ends.py::test_an_app_that_ends",),
+    "the app is killed": (
+        f"{SYSTEM}ends.py::test_an_app_that_ends",
+        f"{WIRE}ur_rig.py::test_the_arm_stands_when_the_app_is_killed",
+        f"{WIRE}xarm_rig.py::test_the_arm_stands_when_the_app_is_killed",
+    ),
     "the [link](several-machines.md) to the computer": (
         f"{SYSTEM}remote.py::test_a_link_that_stalls_stops_the_arm_until_it_is_acknowledged",
     ),
@@ -51,6 +55,7 @@ ELSEWHERE = {
     "the host of a UR dies": (
         f"{WIRE}ur_rig.py::test_the_controller_stops_its_program_when_the_host_is_killed",
         f"{WIRE}ur_rig.py::test_the_arm_stands_150_ms_after_the_last_message",
+        f"{WIRE}ur_faults.py::test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover",
     ),
     "a UFACTORY arm stops": (
         f"{WIRE}xarm_faults.py::test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover",
@@ -58,6 +63,7 @@ ELSEWHERE = {
     "the host of a UFACTORY arm dies": (
         f"{WIRE}xarm_rig.py::test_the_arm_stands_at_its_last_set_point_when_the_host_is_killed",
         f"{WIRE}xarm_rig.py::test_the_arm_stands_while_the_host_is_frozen_and_continues_without_a_jump",
+        f"{WIRE}xarm_faults.py::test_a_fault_in_motion_is_named_and_the_arm_continues_after_recover",
     ),
     "the host of an arm with Damiao": (f"{WIRE}can_gravity.py::test_an_arm_without_its_program_sinks_slowly",),
     "an arm with Damiao motors is closed": (

@@ -1,7 +1,8 @@
-"""An evaluation of a policy on a server, from the command line: failures are episodes with a reason, and it goes on."""
+"""Policies from the command line: failures are episodes with a reason, and a leader takes over without a jump."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import socket
 import subprocess
@@ -10,10 +11,14 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from app_kit import run_here
+from app_kit import CROSS, run_here, write_pad
 
 from hal.apps.rollout import main
+from hal.drivers.servo_bus import bus
+from hal.recording import Dataset
+from hal_emulators.servo_bus.server import ServoBusEmulator, find_leaders
 
 pytest.importorskip("msgpack")
 
@@ -96,6 +101,63 @@ def test_all_episodes_run_although_the_server_is_killed_and_started_again(
     watching = sys.modules[f"watching_{steps}"]
     assert max(watching.reached) - watching.reached[0] > 0.05
     assert max(watching.peaks) <= 1.0 + 1e-6
+
+
+LED = """
+import hal
+
+seen, act = [], lambda observation: hal.JointVelocity([0.1, 0, 0, 0, 0])
+
+
+def watch(rig, observation):
+    now = rig.clock.now()
+    far.advance(now - (seen[-1][0] if seen else now))
+    if seen and seen[-1][0] < moves_at <= now:
+        far.execute("hand 0.3 0.4 -0.3 0.35 0.2 0 0")
+    seen.append((now, *observation.robots["arm"].q_set))
+    return False
+"""
+
+
+def test_a_leader_takes_over_without_a_jump_and_the_policy_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The motors of the leader are emulated, and moved in simulated time; it is elsewhere than the arm."""
+    rig = {
+        "robots": {"arm": {"model": "so101"}},
+        "leaders": {"leader": {"model": "so101_leader", "port": str(tmp_path / "leader.emulated")}},
+        "gamepads": {"pad": {"model": "auto"}},
+        "simulation": {"clock": "lock_step"},
+    }
+    (tmp_path / "led.py").write_text(LED)
+    (tmp_path / "rig.yaml").write_text(json.dumps(rig))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(bus, "_ANSWER", 2.0)
+    led = importlib.import_module("led")
+    pad = write_pad(tmp_path, (0.6, CROSS, 0.9), until=2.8, held=(0.2, 2.5))
+    with ServoBusEmulator(find_leaders(rig), paced=False) as emulator:
+        emulator.arms["leader"].place([0.4, -0.3, 0.2, 0.2, 0.0])
+        led.far, led.moves_at = emulator, 1.0
+        words = ["--config", "./rig.yaml", "--sim", "--policy", "led:act", "--success", "led:watch", "--takeover"]
+        done = run_here(
+            main, *words, "--pad", pad, "--seconds", 1.9, "--rate", 50, "--out", "runs", "--report", "report.json"
+        )
+    assert done.returncode == 0, done.stderr
+    t, q = np.array(led.seen)[:, 0], np.array(led.seen)[:, 1:]
+    (outcome,) = json.loads(Path("report.json").read_text())["episodes"]
+    ((begin, end),) = outcome["interventions"]
+    waits, led_at, goes_on = (t > 0.85) & (t < 1.0), q[t < end][-1], q[t > end]
+    assert np.ptp(q[waits], axis=0).max() < 1e-12, "taken over, before the leader moves"
+    assert led_at - q[waits][0] == pytest.approx([0, 0, 0.15, 0, 0], abs=0.01), "the leader moves its elbow"
+    assert np.abs(np.diff(q, axis=0)).max() < 0.03
+    assert goes_on[-1] - led_at == pytest.approx([0.1 * (t[-1] - end), 0, 0, 0, 0], abs=0.005)
+    assert goes_on[-1][0] - led_at[0] > 0.01
+    episode = Dataset("runs").episodes[0]
+    grid, by_hand = episode.stamps["grid"], episode.columns["intervention"]
+    assert by_hand[(grid > begin + 1e-6) & (grid < end - 1e-6)].all()
+    assert not by_hand[(grid < begin - 1e-6) | (grid > end + 0.03)].any()
+    assert (set(episode.columns["source"][by_hand]), set(episode.columns["source"][~by_hand])) == ({1}, {2})
 
 
 def _wait_for(port: int) -> None:

@@ -78,7 +78,7 @@ def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_
     make_keys(tmp_path, ADDRESS)
     become: Callable[[str], None] = lambda who: monkeypatch.setenv("HAL_KEYS", str(tmp_path / who))  # noqa: E731
     become("host")
-    server, at = start_server(f"{ADDRESS}:0")
+    server, at = start_server(listen=f"{ADDRESS}:0")
     where: Any = split_address(at)
     rig = {"robots": {"panda": {"at": at}}}
     try:
@@ -126,7 +126,7 @@ def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_
                 control.send(hal.JointVelocity([0.0] * 7))
                 (tmp_path / "host" / "certificates.txt").write_text(revoke(tmp_path, "anna"))
                 while True:
-                    arm.check()
+                    control.send(hal.JointVelocity([0.0] * 7))
                     time.sleep(0.01)
         with raises_code(ConnectionLost, "certificate_revoked"):
             hal.open(rig, pad="none")

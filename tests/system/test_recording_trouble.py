@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import os
 import resource
-import shutil
 import signal
 import threading
 import time
@@ -137,16 +136,6 @@ def test_a_disk_that_gets_full_is_noticed_before(rig: Rig, out: Path, tmp_path: 
         recorder.start()
         wait_until(lambda: recorder.status().frames > 5)
         recorder.save(wait=True)
-
-
-def test_a_folder_that_is_deleted_is_written_anew(rig: Rig, out: Path) -> None:
-    with Recorder(rig, out) as recorder:
-        begin(recorder)
-        shutil.rmtree(out)
-        wait_until(lambda: "written there again" in recorder.status().trouble)
-        recorder.save(True, wait=True)
-    usable(out, 15)
-    assert "is gone" in Dataset(out).episodes[0].info["trouble"]
 
 
 def test_a_folder_that_is_moved_can_be_recovered_where_it_is(rig: Rig, out: Path, tmp_path: Path) -> None:

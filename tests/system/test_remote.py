@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import time
@@ -14,12 +15,16 @@ import numpy as np
 import pytest
 from errors_kit import raises_code
 from link_kit import Bench, served_arm, start_server
+from operator_kit import Operator
+from recording_kit import small
 from waiting import wait_until
 
 import hal
+from hal.apps import collect, replay
 from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
 from hal.lock import APP_MARK
+from hal.recording import Dataset
 from hal.servo.watchdog import SILENCE
 from hal.types import RobotStatus, Trip
 
@@ -80,6 +85,33 @@ def test_the_same_program_drives_an_arm_of_another_computer() -> None:
         server.kill()
 
 
+def test_an_episode_with_pictures_is_collected_over_the_link_and_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``hal serve``, ``hal collect`` and ``hal replay``, with a camera and an arm of the other computer."""
+    server, at = start_server(*small(160, 120))
+    person = Operator()
+    try:
+        devices = {"robots": {"panda": {"at": at}}, "cameras": {"scene": {"at": at}}}
+        (tmp_path / "rig.yaml").write_text(json.dumps({**devices, "gamepads": {"pad": {"driver": "mock"}}}))
+        rig, data, report = ["--config", str(tmp_path / "rig.yaml")], str(tmp_path / "data"), tmp_path / "report.json"
+        with person.operate(monkeypatch):
+            words = ["--out", data, "--episodes", "1", "--speed", "0.3"]  # 30 rows a second are enough for 2 mm
+            assert collect.main([*rig, *words]) == 0, person.getvalue()
+        (episode,) = Dataset(data).episodes
+        frames = list(episode.frames("scene"))
+        assert len(frames) == len(list(episode.depth("scene"))) == episode.length
+        assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50, "the arm moved in the pictures"
+        assert (episode.stamps["grid"] >= episode.stamps["camera.scene"]).all(), "times are those of this computer"
+        tcp = episode.columns["observation.tcp"][:, :3]
+        assert np.linalg.norm(tcp[-1] - tcp[0]) > 0.05
+        assert replay.main([data, *rig, "--report", str(report)]) == 0
+        assert json.loads(report.read_text())["deviation"]["tcp_mm"]["max"] < 2.0
+    finally:
+        server.terminate()
+        server.wait()
+
+
 def find_hosts(server: int) -> list[str]:
     """Return the processes that own the devices of a server."""
     found = []
@@ -128,7 +160,6 @@ def test_a_link_that_stalls_stops_the_arm_until_it_is_acknowledged(bench: Bench,
 @pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL])
 def test_a_program_that_freezes_or_is_killed(bench: Bench, what: str, how: signal.Signals) -> None:
     program = bench.drive()
-    hosts = [host.child.process for host in bench.server.served.hosts]
     mail, pid = bench.mail, program.process.pid if what == "the program" else program.link
     began = time.monotonic()
     os.kill(pid, how)
@@ -136,8 +167,8 @@ def test_a_program_that_freezes_or_is_killed(bench: Bench, what: str, how: signa
         wait_until(lambda: mail.peek().status is not RobotStatus.FOLLOWING, "stopped")
         assert mail.peek().t_stop - began <= SILENCE + LATE
         if how is signal.SIGKILL or what != "the program":  # the link is silent for 2 s, or gone
-            wait_until(lambda: all(host.poll() is not None for host in hosts), "nothing is left")
-            wait_until(lambda: bench.server.served is None, "free for the next client")
+            wait_until(lambda: not bench.server.served, "free for the next client")
+            assert mail.peek().status is RobotStatus.IDLE
     finally:
         if how is signal.SIGSTOP:
             os.kill(pid, signal.SIGCONT)
@@ -152,12 +183,32 @@ def test_a_link_that_is_cut_ends_the_program_and_a_new_one_moves_nothing_by_itse
     wait_until(lambda: mail.peek().status is not RobotStatus.FOLLOWING, "stopped")
     assert mail.peek().t_stop - began <= SILENCE + LATE
     assert "connection" in program.wait_for("lost")
-    wait_until(lambda: bench.server.served is None, "free for the next client")
+    wait_until(lambda: not bench.server.served, "free for the next client")
     with hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig:
         rest = rig.robots["panda"].state().q_set
         rig.clock.sleep(0.3)
         assert (rig.robots["panda"].state().q_set == rest).all()
         assert rig.robots["panda"].state().status is RobotStatus.IDLE
+
+
+def test_a_gripper_stops_when_its_program_is_gone_and_the_next_program_moves_it(bench: Bench) -> None:
+    rig_file = {"robots": {"panda": {"at": bench.proxy.at}}}
+    mail = bench.rig.robots["panda"].gripper._mail
+
+    def width() -> float:
+        return float(mail.get().state.width)
+
+    with hal.open(rig_file, pad="none") as rig:
+        start = width()
+        rig.robots["panda"].gripper.start(0.0, speed=0.02)
+        wait_until(lambda: width() < start - 0.005, "it moves")
+        bench.proxy.cut()
+        wait_until(lambda: not bench.server.served, "free for the next client")
+    rest = width()
+    assert rest > 0.005, "it has not come to its goal"
+    with hal.open(rig_file, pad="none") as rig:
+        assert width() == rest
+        assert rig.robots["panda"].gripper.move(0.5 * rest, timeout=10.0).width == pytest.approx(0.5 * rest, abs=1e-3)
 
 
 def test_frames_that_are_lost_repeated_or_out_of_order_change_nothing(bench: Bench) -> None:

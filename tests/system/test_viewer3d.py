@@ -95,26 +95,39 @@ def listening(pid: int) -> list[str]:
 
 
 def test_the_view_is_reached_by_its_user_and_through_the_console_only() -> None:
-    """One open port for the console, none for viser; and the console's page alone is told where the view is."""
+    """One open port for the console, none for viser; the console's page alone is told where the view is.
+
+    A page that is not in control drags nothing.
+    """
     with hal.open("panda_table", sim=True, pad="web", viewer="3d", listen=":0", overrides=["cameras={}"]) as rig:
         viewer, link = rig.viewer3d, urlsplit(rig.console.link)
         assert listening(viewer._child.process.pid) == []
         assert os.stat(os.path.dirname(viewer.address)).st_mode & 0o077 == 0
         site, live, protocol = f"http://{link.netloc}", f"ws://{link.netloc}/live", f"viser-v{viser.__version__}"
-        with connect(live, subprotocols=["hal.v1", link.fragment], origin=site) as page:
-            stage = json.loads(page.recv(timeout=5.0))["rig"]["stage"]
+        driver = connect(live, subprotocols=["hal.v1", link.fragment], origin=site)
+        stage = json.loads(driver.recv(timeout=5.0))["rig"]["stage"] + "/1"
         view = f"ws://{link.netloc}{stage}"
         assert status(f"{site}{stage}/") == 200
         assert status(f"{site}{stage}/", Host="evil.example:8080") == 421
-        for wrong in ("/3d/", f"{stage}x/", f"{stage}/index.html", "/3d/%FF"):
+        for wrong in ("/3d/", "/3d/1", f"{stage}x/", stage[:-2], f"{stage}/index.html", "/3d/%FF", f"{stage[:-1]}%FF"):
             assert status(site + wrong) == 404
-        for address, origin in ((view, "http://evil.example"), (view, None), (f"{view[:-1]}/", site), (live, "null")):
+        for address, origin in ((view, "http://evil.example"), (view, None), (f"{view[:-3]}/1", site), (live, "null")):
             with pytest.raises(InvalidStatus, match="40[34]"):
                 connect(address, subprotocols=[protocol], origin=origin)
         page = PlainPage(stage, rig.console.link)
-        page.drag(HANDLE, beside(rig.robots["panda"].state().tcp))
-        until(lambda: viewer.goal("panda"))
         until(lambda: page.hear() or HANDLE in page.nodes)
+        tcp = rig.robots["panda"].state().tcp
+        page.drag(HANDLE, beside(tcp, 0.2))
+        page.nodes.clear()
+        until(lambda: page.hear() or HANDLE in page.nodes)
+        assert np.abs(np.subtract(page.nodes[HANDLE]["position"], tcp.position)).max() < 2e-3
+        assert viewer.goal("panda") is None
+        driver.send(json.dumps({"type": "lease", "take": True}))
+        until(lambda: rig.console.driver == "page 1")
+        page.drag(HANDLE, beside(tcp))
+        until(lambda: viewer.goal("panda"))
+        driver.close()
+        until(lambda: viewer.goal("panda") is None)
         viewer._child.process.kill()
         with pytest.raises(ConnectionClosed):
             until(page.hear)

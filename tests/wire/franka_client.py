@@ -303,26 +303,6 @@ def cartesian(host: str) -> Report:
     return {"error": attempt(lambda: robot.start_cartesian_pose_control(IMPEDANCE)), **after(robot)}
 
 
-def asynchronous(host: str) -> Report:
-    """Send targets at 50 Hz to the library's handler."""
-    robot = connect(host)
-    handler = franka.AsyncPositionControlHandler
-    configuration = handler.Configuration(maximum_joint_velocities=[0.6] * 7, goal_tolerance=0.01)
-    made = handler.configure(robot, configuration)
-    goal = list(robot.read_once().q)
-    goal[3] += 0.1
-    errors = [made.error_message]
-    began = time.monotonic()
-    while time.monotonic() - began < 0.8:
-        errors.append(made.handler.get_target_feedback().error_message)
-        target = handler.JointPositionTarget(joint_positions=goal)
-        errors.append(made.handler.set_joint_position_target(target).error_message)
-        time.sleep(0.02)
-    made.handler.stop_control()
-    wait_mode(robot, "Idle")
-    return {"errors": [text for text in errors if text], "goal": goal, **after(robot)}
-
-
 if __name__ == "__main__":
     scenario, host, arguments = sys.argv[2:]
     print(json.dumps(globals()[scenario](host, **json.loads(arguments))), flush=True)

@@ -1,7 +1,4 @@
-"""Emulated CAN arms under gravity: at rest, on a recorded drive, and after the end of their program.
-
-Short versions of ``python -m benchmarks can``; ``docs/measured.md`` has the long ones.
-"""
+"""Emulated CAN arms under gravity: at rest, on a recorded drive, and after the end of their program."""
 
 from __future__ import annotations
 

@@ -150,10 +150,3 @@ def test_cartesian_motions_are_refused(client, emulator):
     assert "not possible" in report["error"]
     assert report["mode"] == "Idle"
     assert "Cartesian motions are not emulated" in emulator.events("refused")[-1]["text"]
-
-
-def test_targets_at_50_hz(client):
-    report = client("asynchronous")
-    assert report["errors"] == []
-    assert report["q"] == pytest.approx(report["goal"], abs=1e-3)
-    assert report["mode"] == "Idle"

@@ -232,6 +232,7 @@ def test_an_arm_is_ready_while_another_thread_works(emulator: Emulator) -> None:
 # A robot that ends a motion, and does not answer the library, which then waits for ever.
 
 
+@pytest.mark.pair  # the app has to be on time until the robot is lost
 def test_a_mode_change_without_an_answer_ends_the_motion_and_not_the_process(emulator: Emulator) -> None:
     with rig_of(emulator.host, model_of(emulator)) as rig:
         arm, host = arm_of(rig), rig._hosts[0].child.process.pid

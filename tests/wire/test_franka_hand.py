@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,7 +21,6 @@ from hal.errors import CommandError, ConnectionLost, NotSupported
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
-from .franka_kit import free_host
 from .hand_kit import LIMIT, HandBench
 
 pytestmark = pytest.mark.pair
@@ -217,26 +214,6 @@ def test_the_client_library_ends_with_its_driver(bench):
         assert time.monotonic() < deadline, "it lives on"
         time.sleep(0.01)
     assert not bench.command("state")["client"]
-
-
-def test_the_emulated_hand_is_a_program_too():
-    host = free_host()
-    program = [sys.executable, "-m", "hal_emulators.franka.hand", "--host", host, "--object", "0.03"]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert host in process.stdout.readline()
-        process.stdin.write("state\nstop-ignored perhaps\n")
-        process.stdin.flush()
-        assert json.loads(process.stdout.readline())["object"] == 0.03
-        assert not json.loads(process.stdout.readline())["ok"]
-        with socket.create_connection((host, 1340), timeout=LIMIT) as control, control.makefile("rw") as lines:
-            for line in ('{"command": ["object", "none"]}', "state", "[1"):
-                lines.write(line + "\n")
-            lines.flush()
-            answers = [json.loads(lines.readline()) for _ in range(3)]
-        assert [answer["ok"] for answer in answers] == [True, True, False]
-        assert answers[1]["object"] is None
-        process.stdin.close()
-        assert process.wait(LIMIT) == 0
 
 
 def test_invalid_options_of_the_emulated_hand_are_refused(bench):

@@ -73,13 +73,13 @@ def at(emulator: Emulator, model: str) -> list[str]:
 
 LOSSES = (
     # until s, command to the emulator, repeated every so many s
-    (0.6, "lose-commands next 1", 0.02),
-    (1.2, "lose-commands next 5", 0.05),
-    (2.4, "lose-commands next 19", 0.2),
-    (3.0, "lose-commands 0.01", 1.0),
-    (3.6, "lose-commands 0.05", 1.0),
-    (4.2, "lose-commands 0.2", 1.0),
-    (4.8, "lose-states 0.05", 1.0),
+    (0.4, "lose-commands next 1", 0.02),
+    (0.8, "lose-commands next 5", 0.05),
+    (1.6, "lose-commands next 19", 0.2),
+    (1.9, "lose-commands 0.01", 1.0),
+    (2.3, "lose-commands 0.05", 1.0),
+    (3.0, "lose-commands 0.2", 1.0),
+    (3.4, "lose-states 0.05", 1.0),
 )
 """More than what a cable loses, but no 20 set-points in a row: only these are a fault, by the robot's own rule."""
 

@@ -146,7 +146,6 @@ def test_two_cameras_cannot_record_to_one_file(tmp_path: Path, overwrite: bool) 
         for path in (file, tmp_path / ".." / tmp_path.name / "same.db3"):
             error = open_error(software(name="right", record=str(path), overwrite=overwrite))
             assert error.code == "recording_in_use"
-            assert "camera left" in str(error), "names the other camera"
         assert file.stat().st_ino == written
         left.read(timeout=PATIENCE)
     with opened(software(name="right", record=str(file), overwrite=True)) as cam:  # now it may

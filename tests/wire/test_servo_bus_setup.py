@@ -38,6 +38,18 @@ def answer(monkeypatch: pytest.MonkeyPatch, *steps: Callable[[], Any]) -> None:
     monkeypatch.setattr(builtins, "input", lambda *_: (next(left)() and "") or "")
 
 
+def test_a_leaders_motors_get_their_ids_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    with SteppedServos() as far:
+        servos = far.arm.servos
+        far.execute("baud 57600")
+        for servo in servos:
+            servo.put(servo.protocol.id_address, 1)
+        answer(monkeypatch, *(lambda k=k: far.execute(f"plug {k}") for k in range(len(servos), 0, -1)))
+        leader = f"leaders={{lead: {{model: so101_leader, port: {far.arm.port}}}}}"
+        assert setup_motors.main(options(far, "--set", leader, "--robot", "lead")) == 0
+        assert [(servo.id, servo.baud) for servo in servos] == [(id, 1_000_000) for id in range(1, 7)]
+
+
 def test_new_motors_get_the_ids_of_the_rig_one_after_the_other(
     far: SteppedServos, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

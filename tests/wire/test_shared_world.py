@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from app_kit import run_here
-from benchmark_kit import load_benchmark
 from can_kit import EmulatorProcess
 from waiting import wait_until
 
@@ -33,11 +32,24 @@ for library in ("pyarrow", "av", "zstandard"):
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
 
-tries = load_benchmark("emulated_skills")
 OPTIONS: dict[str, Any] = {"approach": 0.06, "lift": 0.06, "speed": 0.3, "unattended": True}
-AREA = tries.BENCHES["YAM"]
-"""What every arm here reaches."""
-FAR = hal.Pose([0.3, 0.4, AREA.cube["position"][2]])
+CUBE: dict[str, Any] = {
+    "name": "cube",
+    "shape": "box",
+    "half_extents": [0.02, 0.015, 0.02],
+    "mass": 0.3,
+    "position": [0.0, 0.0, 0.621],
+    "rgba": [1, 0.4, 0.7, 1],
+}
+CAMERA = {
+    "sim": True,
+    "model": "realsense_d435",
+    "capture": {"width": 640, "height": 480, "rate_hz": 6},
+    "output": {"width": 256, "height": 256},
+    "look_at": {"target": [-0.08, 0, 0.65], "distance": 0.9, "yaw_deg": 120, "pitch_deg": -30, "roll_deg": 0},
+}
+SCENE = [f"objects=[floor, table, {json.dumps(CUBE)}]", f"cameras={json.dumps({'scene': CAMERA})}"]
+FAR = hal.Pose([0.3, 0.4, CUBE["position"][2]])
 
 
 class Bench:
@@ -58,9 +70,8 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def fr3() -> Iterator[Bench]:
-    sets = [f"objects=[floor, table, {tries.flow(AREA.cube)}]", f"cameras={tries.flow({'scene': tries.CAMERA})}"]
     host = free_host()
-    sets += [f"robots.arm.real.host={host}", "robots.arm.gripper.enabled=true"]
+    sets = [*SCENE, f"robots.arm.real.host={host}", "robots.arm.gripper.enabled=true"]
     words = [word for value in sets for word in ("--set", value)]
     # It waits for a set-point that is late: a busy machine must not look like a fault of the arm.
     with Emulator("--lockstep", "--config", "franka_emulator", *words, host=host, hand=True):
@@ -69,8 +80,7 @@ def fr3() -> Iterator[Bench]:
 
 @pytest.fixture(scope="module", params=["yam_emulator", "piper_emulator"])
 def can(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    sets = [f"objects=[floor, table, {tries.flow(AREA.cube)}]", f"cameras={tries.flow({'scene': tries.CAMERA})}"]
-    with EmulatorProcess(request.param, *sets) as emulator:
+    with EmulatorProcess(request.param, *SCENE) as emulator:
         yield Bench(request.param, emulator.overrides)
 
 
@@ -90,7 +100,7 @@ def prepare(rig: hal.Rig, x: float = -0.08, y: float = 0.03) -> hal.Pose:
     arm.move_to(arm.home, speed=0.3, unattended=True)
     assert arm.gripper is not None
     arm.gripper.open()
-    rig.world.reset("cube", pose=hal.Pose([x, y, AREA.cube["position"][2]]))
+    rig.world.reset("cube", pose=hal.Pose([x, y, CUBE["position"][2]]))
     rig.clock.sleep(0.3)
     found = locate_by_truth(rig, arm, "cube")
     assert found is not None
@@ -135,7 +145,7 @@ def test_fingers_on_a_bus_hold_and_lose(can: Bench) -> None:
         done = grasp(arm, prepare(rig), width=0.03, hold=0.3, **OPTIONS)
         assert done, done.message
         assert done.width == pytest.approx(0.03, abs=1e-3)
-        bottom = AREA.cube["position"][2]
+        bottom = CUBE["position"][2]
         wait_until(lambda: rig.world.pose("cube").position[2] - bottom > 0.05, "lifted")  # the world may be late
         assert arm.gripper is not None
         assert arm.gripper.state().force == pytest.approx(arm.gripper.spec.force, rel=0.2)
@@ -284,7 +294,7 @@ def test_what_a_person_collects_is_imitated(fr3: Bench, tmp_path: Path, monkeypa
     assert status == 0, person.screen.getvalue()
     moved, lifted = (one.columns["rig.object.cube"][:, :3] for one in Dataset(tmp_path / "data").episodes)
     for cube in (moved, lifted):
-        assert cube[0] == pytest.approx(AREA.cube["position"], abs=2e-3), "each begins with the cube where it belongs"
+        assert cube[0] == pytest.approx(CUBE["position"], abs=2e-3), "each begins with the cube where it belongs"
         assert cube[:, 2].max() > cube[0, 2] + 0.05
     assert moved[-1, 1] < moved[0, 1] - 0.05
     assert moved[-1, 2] == pytest.approx(moved[0, 2], abs=2e-3)
@@ -302,7 +312,7 @@ def test_what_a_person_collects_is_imitated(fr3: Bench, tmp_path: Path, monkeypa
 
 
 def test_a_world_that_is_gone_shows_no_new_pictures() -> None:
-    sets = ["objects=[floor]", f"cameras={tries.flow({'scene': tries.CAMERA})}"]
+    sets = ["objects=[floor]", SCENE[1]]
     rig_name = "yam_emulator"
     with EmulatorProcess(rig_name, *sets) as emulator, Bench(rig_name, emulator.overrides).open() as rig:
         camera = rig.cameras["scene"]

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
-import threading
-import time
-from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +11,9 @@ import yaml
 
 pytest.importorskip("av", reason="needs PyAV: pip install 'robot-hal[record]'")
 
+from operator_kit import Operator
 from webcam_kit import grey, webcams
 
-import hal
 from hal.apps import collect, replay
 from hal.recording import Dataset
 
@@ -29,61 +24,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone]
 RATE = 30
 
 
-class Operator(io.StringIO):
-    """The program's output, and a person who reads it with a pad in the hands."""
-
-    pad: Any = None
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.at_home = threading.Event()
-
-    def write(self, text: str) -> int:
-        act = {"then hold it until": self.hold, "place the objects": self.start, "RECORDING": self.drive}
-        for words, what in act.items():
-            if words in text:
-                threading.Thread(target=what).start()
-        return super().write(text)
-
-    def hold(self) -> None:
-        while not self.at_home.wait(2.0):  # a press that was too early does not count
-            self.pad.release("l2")
-            time.sleep(0.2)
-            self.pad.press("l2")
-
-    def start(self) -> None:
-        self.at_home.set()
-        self.pad.release("l2")
-        self.tap("south")
-
-    def tap(self, button: str) -> None:
-        time.sleep(0.2)
-        self.pad.press(button)
-        time.sleep(0.2)
-        self.pad.release(button)
-
-    def drive(self) -> None:
-        self.pad.press("l2")
-        self.pad.stick("dpad_y", 1.0)
-        time.sleep(1.0)
-        self.pad.press("l1")
-        time.sleep(1.0)
-        self.pad.set(axes={"dpad_y": 0.0}, buttons=("l2",))
-        time.sleep(0.5)
-        self.pad.release("l2")
-        self.tap("home")
-
-
 def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    emulator, person, opened = UrEmulator(), Operator(), hal.open
-
-    def open_rig(**options: Any) -> hal.Rig:
-        rig = opened(**options)
-        person.pad = rig.driver("pad")
-        return rig
-
+    emulator, person = UrEmulator(), Operator()
     camera = {"model": "webcam", "capture": {"width": 64, "height": 48, "rate_hz": RATE}}
     ports = {"left": "1-1", "right": "1-2"}
     rig = emulator.rig() | {"gamepads": {"pad": {"driver": "mock"}}}
@@ -94,10 +38,8 @@ def test_what_a_ur_and_two_webcams_collect_is_replayed_within_2_mm(
     try:
         with (
             webcams(tmp_path, *({"port": port} for port in ports.values())),
-            redirect_stdout(person),
-            monkeypatch.context() as patched,
+            person.operate(monkeypatch),
         ):
-            patched.setattr(hal, "open", open_rig)
             words = ["--speed", "0.1", "--out", data, "--episodes", "1", "--task", "reach"]
             assert collect.main([*options, *words]) == 0, person.getvalue()
         (episode,) = Dataset(data).episodes

@@ -168,6 +168,19 @@ def test_the_gripper_holds_names_its_faults_and_moves_again(emulator: XArmEmulat
         assert gripper.move(0.02).width == pytest.approx(0.02, abs=2e-3)
 
 
+@pytest.mark.parametrize("robot", ["xarm5", "lite6"])
+def test_other_arms_are_driven_by_their_models(robot: str) -> None:
+    other = XArmEmulator("--robot", robot, model=robot)
+    try:
+        with hal.open(other.rig()) as rig:
+            arm = rig.robots["arm"]
+            goal = arm.home + 0.1
+            assert arm.move_to(goal, unattended=True).q == pytest.approx(goal, abs=2e-3)
+        assert other.status()["error"] == 0
+    finally:
+        other.close()
+
+
 def test_a_model_of_another_arm_is_refused() -> None:
     other = XArmEmulator("--robot", "xarm6")
     try:

@@ -172,8 +172,8 @@ function renderer3D() {
 
 /** The 3D view, of the rig's own program (drivers/viser). It takes any shape, and opens when it is enlarged. */
 class Stage {
-  /** @param {string} address path on this server @param {(name: string) => void} choose */
-  constructor(address, choose) {
+  /** @param {(name: string) => void} choose */
+  constructor(choose) {
     this.name = "3D";
     this.shape = 0;
     this.visible = false;
@@ -182,8 +182,11 @@ class Stage {
     this.slow = /swiftshader|llvmpipe|softpipe|software|basic render/i.test(renderer3D());
     this.figure.classList.toggle("slow", this.slow);
     const frame = make("iframe");
-    this.open = () => frame.src || (frame.src = `${address}/`);
-    frame.title = "3D view: drag the gizmo on the tool, and the arm moves to it while the dead-man is held";
+    this.frame = frame;
+    this.opened = false;
+    /** Path on this server; every connection of this page has another. */
+    this.address = "";
+    frame.title = "3D view: hold to move and drag the gizmo on the tool, and the arm follows it";
     frame.tabIndex = -1;
     // The keys stay with this page: a press does not move the focus, and what gets it all the same gives it back.
     const keep = (/** @type {Event} */ event) => event.preventDefault();
@@ -197,7 +200,16 @@ class Stage {
     this.figure.addEventListener("click", () => choose(this.name)); // while it is small: its frame takes no pointer then
   }
 
-  mark() {}
+  open() {
+    this.opened = true;
+    if (this.frame.getAttribute("src") !== this.address) this.frame.src = this.address;
+  }
+
+  /** @param {string} address */
+  move(address) {
+    this.address = address;
+    if (this.opened) this.open();
+  }
 }
 
 /** The panel of the 3D view and of all cameras. */
@@ -221,9 +233,10 @@ export class Cameras {
   /** Lay out the panel and connect. @param {any[]} cameras of hello @param {string} stage path of the 3D view, or "" */
   open(cameras, stage) {
     const names = cameras.map((camera) => camera.name);
-    const all = [stage, ...names].join("\n");
-    if (this.#built !== all) this.#build(cameras, renderer3D() ? stage : "");
+    const all = [stage !== "", ...names].join("\n");
+    if (this.#built !== all) this.#build(cameras, stage !== "" && renderer3D() !== "");
     this.#built = all;
+    this.stage?.move(stage);
     this.pictures.open(names);
   }
 
@@ -239,12 +252,12 @@ export class Cameras {
     for (const view of this.views) if (view.visible) view.mark(now);
   }
 
-  /** @param {any[]} cameras @param {string} stage */
-  #build(cameras, stage) {
+  /** @param {any[]} cameras @param {boolean} staged whether there is a 3D view */
+  #build(cameras, staged) {
     this.seen.disconnect();
     const enlarge = (/** @type {string} */ name) => this.#enlarge(name, true);
     this.views = cameras.map((camera) => new View(camera, enlarge));
-    this.stage = stage ? new Stage(stage, enlarge) : null;
+    this.stage = staged ? new Stage(enlarge) : null;
     this.shown = this.stage ? [this.stage, ...this.views] : this.views;
     byId("cameras").replaceChildren(...this.shown.map((view) => view.figure));
     const names = this.shown.map((view) => view.name);

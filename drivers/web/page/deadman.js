@@ -68,7 +68,12 @@ export class Heartbeat {
     this.#probe = null;
   }
 
-  /** Report the pad as gone. @param {"hidden" | "blur" | "closing" | "hands"} why */
+  /** Send a message if one is due: a headset may slow down the timers of its browser, but not its pictures. */
+  pump() {
+    if (performance.now() - this.#lastBeat >= PERIOD) this.#beat();
+  }
+
+  /** Report the pad as gone. @param {Why | "hands"} why */
   leave(why) {
     this.#running = false;
     this.connection.send({ type: "away", why });
@@ -109,22 +114,24 @@ export class Heartbeat {
     this.#sentAt = now;
     if (this.#probe === null || now - this.#probe > 1000) this.#probe = now;
     const axes = this.pad.axes.map((value) => Math.round(value * 1e4) / 1e4);
-    this.connection.send({
-      type: "pad", seen: this.#seen, since: performance.now() - this.#seenAt, axes, buttons: this.pad.mask,
-    });
+    const state = { seen: this.#seen, since: performance.now() - this.#seenAt, axes, buttons: this.pad.mask };
+    const { pose } = this.pad;
+    this.connection.send(pose.length ? { type: "hand", ...state, pose } : { type: "pad", ...state });
   }
 }
 
-/** @typedef {"hidden" | "blur" | "closing"} Why */
+/** @typedef {"hidden" | "blur" | "closing" | "headset"} Why */
 
-/** Whether the page is visible and has the focus: only then may it drive. */
+/** Whether the page is visible and has the focus, or is shown by a headset: only then may it drive. */
 export class Presence {
   constructor() {
+    /** The headset's session, while there is one. @type {any} */
+    this.session = null;
     this.present = this.#isInFront();
     /** @type {(why: Why) => void} */
     this.left = () => {};
     this.came = () => {};
-    addEventListener("blur", () => this.#leave("blur"));
+    addEventListener("blur", () => this.session || this.#leave("blur"));
     addEventListener("pagehide", () => this.#leave("closing"));
     addEventListener("focus", () => this.#update());
     addEventListener("pageshow", () => this.#update());
@@ -139,11 +146,12 @@ export class Presence {
   }
 
   #isInFront() {
+    if (this.session) return this.session.visibilityState === "visible";
     return document.visibilityState === "visible" && document.hasFocus();
   }
 
   #update() {
-    if (!this.#isInFront()) this.#leave(document.visibilityState === "visible" ? "blur" : "hidden");
+    if (!this.#isInFront()) this.#leave(this.session ? "headset" : document.visibilityState === "visible" ? "blur" : "hidden");
     else if (!this.present) {
       this.present = true;
       this.came();

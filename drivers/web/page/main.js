@@ -8,6 +8,7 @@ import { Controls } from "./controls.js";
 import { Heartbeat, Presence, ReleaseWatch } from "./deadman.js";
 import { byId, openTheme, setAttribute, setData, setText, show } from "./dom.js";
 import { BrowserGamepad } from "./gamepad.js";
+import { Headset } from "./headset.js";
 import { Keyboard } from "./keyboard.js";
 import { PAD_SILENCE } from "./keys.js";
 import { Pad } from "./pad.js";
@@ -36,6 +37,10 @@ const stop = () => stopping.stop();
 const keyboard = new Keyboard(pad, mayDrive, stop);
 const releases = new ReleaseWatch(pad, keyboard);
 const gamepad = new BrowserGamepad(pad, (text) => log.add(text));
+const headset = new Headset(pad, presence, stop, (text) => {
+  log.add(text);
+  status.notice(text);
+});
 
 /** @type {any} */
 let hello = null;
@@ -71,7 +76,7 @@ const HANDLERS = {
     recording.forget();
     panel.open(rig.robots);
     settings.open(rig);
-    cameras.open(rig.cameras, rig.stage);
+    cameras.open(rig.cameras, rig.stage && `${rig.stage}/${hello.page}/`);
     gamepad.describe();
   },
   lease(message) {
@@ -189,7 +194,8 @@ releases.lost = (why) => {
   pad.reset();
 };
 
-heartbeat.before.push((dt) => releases.check(dt), (dt) => keyboard.moveGrip(dt), () => gamepad.read());
+heartbeat.before.push((dt) => releases.check(dt), (dt) => keyboard.moveGrip(dt), () => gamepad.read(), () => headset.check());
+headset.shown = () => heartbeat.pump();
 heartbeat.stalled = (ms) => {
   log.add("this computer is too busy: the page hung");
   status.note("hang", ms);

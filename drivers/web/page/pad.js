@@ -93,6 +93,8 @@ export class Pad {
     this.held = false;
     /** Position of the gripper's slider, 0 open .. 1 closed; it stays where it is. */
     this.grip = 0;
+    /** Pose of the hand that holds, in the axes of an arm's base: x, y, z in m, and a quaternion; empty without one. */
+    this.pose = /** @type {number[]} */ ([]);
     this.deadman = "l2";
     /** @type {string | null} */
     this.home = null;
@@ -112,6 +114,7 @@ export class Pad {
   /** @type {Taps} */ #taps;
   /** Mask of the buttons that move nothing, and of those that do. */
   #moveless = 0;
+  #posed = /** @type {number[]} */ ([]);
   #moving = 0;
 
   /** Whether something is pushed that may move the arm. The gripper's slider does not count: it stays where it is. */
@@ -213,7 +216,8 @@ export class Pad {
   /** @param {number[]} axes @param {number} mask @param {boolean} held */
   #take(axes, mask, held) {
     const edge = mask !== this.mask || axes.some((value, place) => (value === 0) !== (this.axes[place] === 0));
-    if (!edge && axes.every((value, place) => value === this.axes[place])) return;
+    if (!edge && this.pose === this.#posed && axes.every((value, place) => value === this.axes[place])) return;
+    this.#posed = this.pose;
     this.axes = axes;
     this.mask = mask;
     this.held = held;

@@ -33,6 +33,7 @@ const PAGE_TRIPS = {
   deadman_lost: "the page in control was disconnected",
 };
 
+const RECOVER = 'Press "Recover", then release everything and hold again.';
 const TAKE = 'Press "Take control" to drive.';
 
 /** Return the state of the dead-man in one word. @param {any} deadman of a robot's state */
@@ -154,7 +155,8 @@ export class Status {
     if (faulty !== undefined) {
       const { code, cause, remedy } = robots[faulty].fault;
       setText(byId("fault-cause"), `${called(faulty)}Fault: ${cause} (${code})`);
-      setText(byId("fault-remedy"), remedy);
+      const first = remedy && `${sentence(remedy).replace(/\.$/, "")}. `;
+      setText(byId("fault-remedy"), first + (this.lease.mine ? RECOVER : this.#remedy(robots[faulty])));
     }
     show(byId("fault"), faulty !== undefined);
     show(byId("recover"), this.lease.mine);

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CommandError
-from ..layout import STATE, finish_replacement, put_in_place
+from ..layout import STATE, put_in_place
 from .actions import ActionForm, rotation_observations
 from .content import EpisodeContent, PictureStream, observations
 
@@ -158,8 +158,7 @@ def _check(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> None:
 
 
 def _sweep(path: Path) -> None:
-    """Remove the temporary files of a killed program, and restore what it had just moved away."""
-    finish_replacement(path)
+    """Remove the temporary files of a killed program."""
     name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.partial")
     for file in path.parent.iterdir():
         match = name.fullmatch(file.name)

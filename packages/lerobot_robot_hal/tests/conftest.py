@@ -40,6 +40,10 @@ if find_spec("lerobot") is None:
             "RobotConfig": type("RobotConfig", (_Choice,), {}),
             "make_robot_from_config": _make_robot,
         },
+        "lerobot.cameras": {"CameraConfig": type("CameraConfig", (_Choice,), {"fps": None, "width": 0, "height": 0})},
+        "lerobot.cameras.utils": {
+            "make_cameras_from_configs": lambda configs: {name: _make_robot(config) for name, config in configs.items()}
+        },
         "lerobot.teleoperators": {
             "Teleoperator": _Device,
             "TeleoperatorConfig": type("TeleoperatorConfig", (_Choice,), {}),

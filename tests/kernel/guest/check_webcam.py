@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import re
 import time
 from collections.abc import Iterator
@@ -125,6 +126,30 @@ def check_stamps_and_numbers_fit(cameras: None, measured: Measured, lost: int) -
     assert gaps >= (20 if lost else 3)
     assert max(map(abs, off)) < 0.5 / _RATE
     measured(f"{gaps} gaps; a stamp is off its number by at most {1e3 * max(map(abs, off)):.2f} ms")
+
+
+def check_a_long_run_has_no_wrong_stamp(cameras: None, measured: Measured) -> None:
+    """At 30 frames a second, for as long as the script was told."""
+    seconds, rate = float(os.environ["HAL_KERNEL_SECONDS"]), 30.0
+    driver = V4l2Camera(_spec(rate))
+    driver.open()
+    try:
+        first = last = driver.grab(5.0)
+        assert first is not None
+        count, wrong, farthest, oldest = 1, 0, 0.0, 0.0
+        while last.t < first.t + seconds:
+            frame = driver.grab(5.0)
+            assert frame is not None
+            off = abs(frame.t - first.t - (frame.seq - first.seq) / rate)
+            wrong += not (off < 0.5 / rate and frame.seq > last.seq and frame.t > last.t)
+            farthest, oldest = max(farthest, off), max(oldest, time.monotonic() - frame.t)
+            count, last = count + 1, frame
+    finally:
+        driver.close()
+    lost = last.seq - first.seq + 1 - count
+    ages = f"off by at most {1e3 * farthest:.2f} ms, at most {1e3 * oldest:.0f} ms old"
+    measured(f"{count} frames in {last.t - first.t:.0f} s, {lost} lost, {wrong} wrong stamps: {ages}")
+    assert wrong == 0
 
 
 def check_controls_are_set_and_their_automatics_switched_off(cameras: None) -> None:

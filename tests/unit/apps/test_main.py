@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -62,6 +63,19 @@ def test_a_mistake_is_a_message(words: list[str], text: str) -> None:
     done = run_here(main, *words)
     assert done.returncode == 2
     assert text in done.stderr
+
+
+def test_a_second_ctrl_c_after_the_end_of_a_program_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python's own end follows, in which the default of Python would raise KeyboardInterrupt."""
+    monkeypatch.setattr(sys, "argv", ["hal", "--version"])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["--version"]) == 0
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler, "the caller's process goes on"
+        assert main() == 0
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 PACKAGE = """

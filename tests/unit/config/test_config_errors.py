@@ -251,7 +251,9 @@ def test_missing_file_and_unknown_rig(tmp_path: Path) -> None:
         ("", "wrong_type"),
         ("robots: !!python/object/apply:os.system ['true']", "bad_yaml"),
         ("a: 1\n---\nb: 2\n", "bad_yaml"),
-        ("objects: &all [*all]", "too_large"),
+        ("a: *nowhere", "bad_yaml"),
+        ("robots: " + "[" * 2_000, "bad_yaml"),
+        ("objects: &all [*all]", "bad_yaml"),
     ],
 )
 def test_files_that_are_no_rig(tmp_path: Path, text: str, code: str) -> None:

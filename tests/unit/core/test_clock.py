@@ -74,12 +74,16 @@ def test_an_event_wakes_a_loop_between_its_turns() -> None:
     assert [tick.dt for tick in ticks[1:]] == pytest.approx([b.t - a.t for a, b in itertools.pairwise(ticks)])
 
 
-def test_no_event_wakes_a_loop_in_lock_step() -> None:
+def test_an_event_wakes_a_loop_in_lock_step_4_ms_after_the_last_turn_at_the_earliest() -> None:
     clock, _ = lock_step()
     woken = threading.Event()
+    clock.call_every(0.031, woken.set)
+    ticks = list(itertools.islice(clock.rate(50.0, wake=woken), 5))
+    assert [tick.elapsed for tick in ticks] == pytest.approx([0.0, 0.02, 0.031, 0.04, 0.06])
     woken.set()
     ticks = list(itertools.islice(clock.rate(50.0, wake=woken), 3))
-    assert [tick.elapsed for tick in ticks] == pytest.approx([0.0, 0.02, 0.04])
+    assert [tick.elapsed for tick in ticks] == pytest.approx([0.0, 0.004, 0.02])
+    assert [tick.dt for tick in ticks[1:]] == pytest.approx([0.004, 0.016])
 
 
 @pytest.mark.parametrize("hz", [0.0, -1.0, float("nan")])

@@ -66,6 +66,7 @@ def test_a_host_that_does_not_ask_stays_as_it_is(start: START) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.pair  # of its processes none is to begin at idle priority
 def test_a_host_that_never_pauses_loses_its_priority_and_then_its_life(start: START) -> None:
     child = start()
     soft, hard = (limit / 1e6 for limit in child.ready["limits"])

@@ -11,15 +11,70 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
+from hal.errors import HalError
+
+Execute = Callable[[str], "dict[str, Any]"]
+"""Executes a command and returns its answer. Raises ValueError if it is invalid."""
 CONTROL_PORT = 1339
 """TCP port of a Franka's emulator; that of emulated buses is a free one, which it prints."""
 
 
-def add_rig_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of an emulator that plays every device of its kind in a rig."""
+class Started(NamedTuple):
+    """An emulator of a rig's devices at work."""
+
+    execute: Execute
+    places: str
+    """Where its devices are."""
+    check: Callable[[], None] = lambda: None
+    """Called from time to time; raises what ends the emulator."""
+
+
+def run_emulator(
+    kind: str,
+    description: str,
+    commands: str,
+    arguments: Sequence[str] | None,
+    start: Callable[[argparse.Namespace, contextlib.ExitStack], Started],
+) -> int:
+    """Run an emulator of every device of its kind in a rig until it is asked to end, and return its exit status.
+
+    Args:
+        kind: Its name for ``hal emulate``.
+        description: What it plays; what it proves is added.
+        commands: Help on its commands.
+        arguments: The command line; None for that of this program.
+        start: Starts it, for these options; the stack is closed at the end.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"hal emulate {kind}",
+        description=f"{description} What the manuals leave open is assumed; it proves nothing about a real one.",
+        epilog="commands, typed here or sent to the control port; with several devices, the arm's name first:\n"
+        + commands,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_rig_options(parser)
+    options = parser.parse_args(arguments)
+    ends = note_signals()
+    try:
+        with contextlib.ExitStack() as stack:
+            started = start(options, stack)
+            port = CommandPort(started.execute, options.port)
+            print(f"ready: {started.places}; control port {port.number}; help lists the commands", flush=True)
+            serve_prompt(started.execute)
+            while not ends:
+                time.sleep(0.1)
+                started.check()
+            port.close()
+    except (HalError, OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _add_rig_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
     parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
@@ -89,10 +144,6 @@ class EmulatorControl:
         self.close()
 
 
-Execute = Callable[[str], "dict[str, Any]"]
-"""Executes a command and returns its answer. Raises ValueError if it is invalid."""
-
-
 def serve_prompt(execute: Execute) -> None:
     """Execute the lines of standard input, in a thread, until it ends. Answers are for a reader: text, or JSON."""
 
@@ -107,6 +158,7 @@ def serve_prompt(execute: Execute) -> None:
                         flush=True,
                     )
 
+    signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # in the background: reading a terminal would stop this program
     threading.Thread(target=serve, name="prompt", daemon=True).start()
 
 
@@ -117,10 +169,10 @@ class CommandPort:
         number: The port.
     """
 
-    def __init__(self, execute: Execute, number: int = 0) -> None:
+    def __init__(self, execute: Execute, number: int = 0, host: str = "127.0.0.1") -> None:
         """Listen on a port, 0 for a free one. Raises OSError if it is taken."""
         self._execute = execute
-        self._listener = socket.create_server(("127.0.0.1", number))
+        self._listener = socket.create_server((host, number))
         self.number: int = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, name="control-port", daemon=True).start()
 

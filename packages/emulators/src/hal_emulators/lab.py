@@ -12,11 +12,11 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from hal.config.loader import load
 from hal.specs import RobotSpec
 from hal_emulators.control import note_signals
-from hal_emulators.shared_world import find_address, has_world
+from hal_emulators.shared_world import find_address, has_world, load_real
 from hal_emulators.ur.motion import ROBOTS
+from hal_emulators.xarm.controller import ROBOTS as XARMS
 
 _END = 10.0
 """Longest time that the emulators take to end, s."""
@@ -45,7 +45,7 @@ def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]
         ConfigError: The rig is not valid.
         ValueError: A device is not at an address of this computer, a UR's model has no emulator, or nothing is real.
     """
-    rig = load(config, sim=False, overrides=overrides).resolve()
+    rig = load_real(config, overrides)
     words = ["--config", config, *(word for value in overrides for word in ("--set", value))]
     foreign = [arm.name for arm in rig.robots if arm.attended and not arm.emulated]
     if foreign:
@@ -81,7 +81,8 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
             raise ValueError(f"{arm.name}: its model {arm.model} has no emulator, only {known}")
         return Emulator(arm.name, ["ur", "--robot", arm.model, *options])
     if driver == "xarm":
-        return Emulator(arm.name, ["xarm", "--robot", f"xarm{len(arm.joints)}", *options])
+        robot = arm.model if arm.model in XARMS else f"xarm{len(arm.joints)}"  # a model of one's own
+        return Emulator(arm.name, ["xarm", "--robot", robot, *options])
     bare = arm.gripper is None or arm.gripper.driver != driver
     hand = ["--end-effector", "none", "--no-hand"] if bare else []
     return Emulator(arm.name, ["franka", "--robot", _FRANKA[arm.options["arm"]], *hand, *options])

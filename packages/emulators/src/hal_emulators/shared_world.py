@@ -9,12 +9,14 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from hal.config.loader import load
 from hal.drivers.scene.shared import Connection, address_of
 from hal.errors import ConnectionLost
-from hal.specs import RobotSpec
+from hal.specs import Plan, RobotSpec
 
 PRIORITY = 40
 """Of an emulator among SCHED_FIFO threads; a host has 50."""
@@ -106,9 +108,16 @@ def raise_priority(priority: int) -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 
+def load_real(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> Plan:
+    """Return a rig with everything real; beside leaders, arms without ``real`` are simulated. Raises ConfigError."""
+    rig = load(config, overrides=overrides)
+    bare = [f"robots.{name}.sim=true" for name, arm in rig.robots.items() if rig.leaders and not arm.real]
+    return load(config, sim=False, overrides=[*overrides, *bare]).resolve()
+
+
 def has_world(config: str, overrides: Sequence[str] = ()) -> bool:
     """Return whether a rig has a simulated world in which all arms are emulated. Raises ConfigError."""
-    world = load(config, sim=False, overrides=overrides).resolve().world
+    world = load_real(config, overrides).world
     return world is not None and bool(world.robots) and all(robot.emulated for robot in world.robots)
 
 

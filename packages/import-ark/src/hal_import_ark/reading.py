@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from hal.config.files import PlacedErrors, Problems, check_size, suggest
+from hal.config.files import PlacedErrors, Problems, suggest
 from hal.config.schema import describe, is_number
 from hal.errors import ConfigError
 from hal.kinematics.mesh_files import package_folder
@@ -211,7 +211,6 @@ class _Loader(PlacedErrors, yaml.SafeLoader):
 
 def _parse(text: str) -> tuple[yaml.Node | None, Any]:
     """Return one document, as nodes with their lines and as data. Raises yaml.YAMLError."""
-    check_size(text, _Loader)
     loader = _Loader(text)
     try:
         root = loader.get_single_node()

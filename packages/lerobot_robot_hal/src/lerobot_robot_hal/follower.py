@@ -38,7 +38,8 @@ DRIVER = DriverSpec(
     name="lerobot",
     robot="lerobot_robot_hal.follower:LeRobotArm",
     gripper="lerobot_robot_hal.follower:LeRobotGripper",
-    checks={"robot": "lerobot_robot_hal.follower:check_arm"},
+    camera="lerobot_robot_hal.camera:LeRobotCamera",
+    checks={"robot": "lerobot_robot_hal.follower:check_arm", "camera": "lerobot_robot_hal.camera:check_camera"},
     steppable=False,
     preflight="lerobot_robot_hal.follower:check",
     shared_options=("type", "config"),
@@ -101,31 +102,38 @@ def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
             yield f"real.{key}", f"must have {n} entries, for {', '.join(spec.joints)}", "wrong_count"
 
 
-def make_robot(type_: str, config: dict[str, Any]) -> Any:
-    """Return a robot of LeRobot. Raises ValueError for an unknown type or configuration."""
-    from lerobot import robots
+def find_config(what: str, package: Any, choices: Any, type_: str) -> Any:
+    """Return the class of the configuration of a robot or a camera. Raises ValueError for an unknown type."""
 
     def known() -> Any:
         with suppress(Exception):  # of draccus, for an unknown name
-            return robots.RobotConfig.get_choice_class(type_)
+            return choices.get_choice_class(type_)
         return None
 
-    for module in pkgutil.iter_modules(getattr(robots, "__path__", [])):
+    for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
         if known() is None and module.ispkg:
-            with suppress(ImportError):  # the libraries of another robot
-                importlib.import_module(f"lerobot.robots.{module.name}")
+            with suppress(ImportError):  # the libraries of another one
+                importlib.import_module(f"{package.__name__}.{module.name}")
     if known() is None:
         with suppress(ImportError):
             from lerobot.utils.import_utils import register_third_party_plugins
 
             register_third_party_plugins()
     if known() is None:
-        raise ValueError(f"LeRobot knows no robot {type_!r}, or a library that it needs is missing")
+        raise ValueError(f"LeRobot knows no {what} {type_!r}, or a library that it needs is missing")
+    return known()
+
+
+def make_robot(type_: str, config: dict[str, Any]) -> Any:
+    """Return a robot of LeRobot. Raises ValueError for an unknown type or configuration."""
+    from lerobot import robots
+
+    known = find_config("robot", robots, robots.RobotConfig, type_)
     given = config | ({"calibration_dir": Path(config["calibration_dir"])} if "calibration_dir" in config else {})
-    if "disable_torque_on_disconnect" in getattr(known(), "__dataclass_fields__", {}):
+    if "disable_torque_on_disconnect" in getattr(known, "__dataclass_fields__", {}):
         given.setdefault("disable_torque_on_disconnect", False)  # an arm that is closed holds
     try:
-        return robots.make_robot_from_config(known()(**given))
+        return robots.make_robot_from_config(known(**given))
     except TypeError as error:
         raise ValueError(f"config of {type_}: {error}") from None
 

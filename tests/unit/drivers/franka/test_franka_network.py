@@ -154,7 +154,7 @@ def may_ping() -> bool:
     return True
 
 
-@pytest.mark.skipif(not may_ping(), reason="needs net.ipv4.ping_group_range, or the package iputils-ping")
+@pytest.mark.skipif(not may_ping(), reason="needs net.ipv4.ping_group_range")
 def test_round_trips_are_measured() -> None:
     trips = measure_round_trips("127.0.5.1", 0.3)
     assert 20 < trips.sent <= 300
@@ -162,28 +162,8 @@ def test_round_trips_are_measured() -> None:
     assert trips.lost < trips.sent
 
 
-def test_without_permission_the_ping_program_measures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the output of iputils' ping: a new one, which allows 2 ms, and an old one, which allows 200 ms."""
+def test_without_permission_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     forbid_icmp(monkeypatch)
-    program = tmp_path / "ping"
-    program.write_text(
-        '#!/bin/sh\necho "$@" >> "$0.log"\n'
-        'case "$*" in *"-i 0.002"*) echo "ping: cannot flood; minimal interval allowed for user is 200ms" >&2\n'
-        "exit 2;; esac\n"
-        "echo '1208 bytes from 127.0.5.1: icmp_seq=1 ttl=64 time=0.279 ms'\n"
-        "echo '1208 bytes from 127.0.5.1: icmp_seq=2 ttl=64 time=0.224 ms'\n"
-        "echo '3 packets transmitted, 2 received, 33.3333% packet loss, time 400ms'\n"
-    )
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    trips = measure_round_trips("127.0.5.1", 0.5)
-    assert (trips, trips.lost) == (RoundTrips(3, [0.000224, 0.000279]), 1)
-    assert "-s 1200" in (tmp_path / "ping.log").read_text()
-
-
-def test_without_permission_and_program_nothing_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    forbid_icmp(monkeypatch)
-    monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(NotMeasured):
         measure_round_trips("127.0.5.1", 0.5)
 

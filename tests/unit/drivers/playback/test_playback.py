@@ -126,27 +126,29 @@ def test_recording_may_contain_its_model(write: Write) -> None:
     assert pad.poll(0.0, 0.0).axes["right_y"] == 1.0
 
 
-def test_every_bad_line_is_a_problem_with_its_number(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "line",
+    [
+        {**HEADER, "version": 2},
+        {**HEADER, "ranges": {"ABS_X": [5, 5]}},
+        {**HEADER, "ranges": {"ABS_Q": [0, 1]}},
+        [],
+        {"t": -1, "type": "key", "code": "BTN_SOUTH", "value": 1},
+        {"t": 1, "type": "rel", "code": "REL_X", "value": 1},
+        {"t": 1, "type": "key", "code": "BTN_NOSE", "value": 1},
+        {"t": 1, "type": "key", "code": "BTN_SOUTH", "value": 0.5},
+        {"t": 1, "type": "key", "code": ["BTN_SOUTH"], "value": 1},
+        {"t": 1, "type": "key", "code": "BTN_SOUTH", "value": 1},
+    ],
+)
+def test_a_bad_line_is_named(tmp_path: Path, line: Any) -> None:
     path = tmp_path / "bad.jsonl"
-    lines = [
-        json.dumps({**HEADER, "version": 2, "ranges": {"ABS_X": [5, 5], "ABS_Q": [0, 1]}}),
-        '{"t": 0.0, "type": "abs", "code": "ABS_X", "value": ',
-        "[]",
-        json.dumps({"t": -1, "type": "key", "code": "BTN_SOUTH", "value": 1}),
-        json.dumps({"t": 1, "type": "rel", "code": "REL_X", "value": 1}),
-        json.dumps({"t": 1, "type": "key", "code": "BTN_NOSE", "value": 1}),
-        json.dumps({"t": 1, "type": "key", "code": "BTN_SOUTH", "value": 0.5}),
-        json.dumps({"t": 2, "type": "key", "code": "BTN_SOUTH", "value": 1}),
-        json.dumps({"t": 1, "type": "key", "code": "BTN_SOUTH", "value": 1}),
-        "",
-        json.dumps({"t": 3, "type": "key", "code": ["BTN_SOUTH"], "value": 1}),
-    ]
-    path.write_text("\n".join(lines), encoding="utf-8")
+    before = [HEADER, {"t": 2, "type": "key", "code": "BTN_SOUTH", "value": 1}]
+    lines = [line] if isinstance(line, dict) and "version" in line else [*before, line]
+    path.write_text("\n".join(map(json.dumps, lines)), encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load_recording(path)
-    keys = [problem.key for problem in caught.value.problems]
-    assert sorted(keys) == sorted(["line 1"] * 3 + [f"line {number}" for number in (2, 3, 4, 5, 6, 7, 9, 11)])
-    assert {problem.file for problem in caught.value.problems} == {str(path)}
+    assert [(problem.file, problem.key) for problem in caught.value.problems] == [(str(path), f"line {len(lines)}")]
 
 
 @pytest.mark.parametrize("text", ["", "\n\n", "hello", '{"format": "else"}', "\x00\xff"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from time import monotonic
@@ -13,14 +13,16 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from servo_bus_kit import SteppedServos, so101_leader
+from waiting import wait_until
 
 from hal.config import load
 from hal.driver import PadReading
 from hal.drivers.servo_bus import bus
-from hal.drivers.servo_bus.leader import DynamixelLeader, FeetechLeader
+from hal.drivers.servo_bus.leader import ServoLeader
+from hal.errors import ConfigError
 from hal.leader import Leader
 from hal.lock import DeviceLock
-from hal_emulators.servo_bus.server import ServoBusEmulator, find_leaders
+from hal_emulators.servo_bus.server import ServoBusEmulator, find_arms, find_leaders
 
 Q = [0.3, -0.4, 0.5, 0.2, -1.0]
 
@@ -33,17 +35,17 @@ def far() -> Iterator[SteppedServos]:
 
 
 @pytest.fixture
-def leader(far: SteppedServos) -> Iterator[FeetechLeader]:
+def leader(far: SteppedServos) -> Iterator[ServoLeader]:
     with closing(so101_leader(far)) as driver:
         driver.open()
         yield driver
 
 
-def poll(leader: FeetechLeader) -> PadReading:
+def poll(leader: ServoLeader) -> PadReading:
     return leader.poll(monotonic(), 0.0)
 
 
-def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader: FeetechLeader) -> None:
+def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader: ServoLeader) -> None:
     before = {id: bytes(servo.registers[:56]) for id, servo in {servo.id: servo for servo in far.arm.servos}.items()}
     assert poll(leader).joints == pytest.approx(Q, abs=0.001)
     far.execute("hand 0.1 0 0 0.1 0 0 1")
@@ -68,7 +70,7 @@ def test_it_reads_joints_and_lever_and_writes_nothing(far: SteppedServos, leader
     ],
 )
 def test_what_is_no_leader_is_refused_by_name(
-    command: str, cause: str, far: SteppedServos, leader: FeetechLeader
+    command: str, cause: str, far: SteppedServos, leader: ServoLeader
 ) -> None:
     far.execute(command)
     far.advance(0.01)
@@ -77,7 +79,7 @@ def test_what_is_no_leader_is_refused_by_name(
     assert leader.notes == (f"lead: {leader.describe().partition(': ')[2]}",)
 
 
-def test_a_port_that_another_program_uses_is_left_to_it(far: SteppedServos, leader: FeetechLeader) -> None:
+def test_a_port_that_another_program_uses_is_left_to_it(far: SteppedServos, leader: ServoLeader) -> None:
     lock = DeviceLock(f"servo-bus-{os.path.realpath(far.arm.port)}", "the servo bus", 0.1)
     with patch.object(bus, "_PATIENCE", 0.0):
         assert not poll(leader).connected
@@ -93,7 +95,7 @@ def test_a_gello_is_read_by_its_own_signs_offsets_and_trigger(tmp_path: Path) ->
     rig = {"leaders": {"lead": entry}}
     with ServoBusEmulator(find_leaders(rig), paced=False) as far, patch.multiple(bus, _ANSWER=2.0):
         far.arms["lead"].place([0.2, -0.5, 0.1, -2.0, 0.3, 1.8, 0.7])
-        with closing(DynamixelLeader(load(rig).resolve().pads[0])) as leader:
+        with closing(ServoLeader(load(rig).resolve().pads[0])) as leader:
             leader.open()
             reading = poll(leader)
             led = [sign * q for sign, q in zip(signs, (0.2, -0.5, 0.1, -2.0, 0.3, 1.8, 0.7), strict=True)]
@@ -108,7 +110,99 @@ def test_a_gello_is_read_by_its_own_signs_offsets_and_trigger(tmp_path: Path) ->
             assert later.axes["r2"] == pytest.approx(0.5, abs=0.02)
 
 
-def test_an_emulated_leader_may_not_lead_a_real_arm(leader: FeetechLeader) -> None:
+def test_a_rate_at_which_a_reading_takes_too_long_is_refused() -> None:
+    rig = {"leaders": {"lead": {"model": "gello_franka", "port": "/dev/lead", "options": {"baud": 57_600}}}}
+    with pytest.raises(ConfigError, match="57600 bit/s is too slow: a reading of 8 motors takes 82 ms, at most 8 are"):
+        load(rig)
+
+
+def test_a_leader_is_emulated_beside_an_arm_that_has_no_port() -> None:
+    rig = {"robots": {"arm": {"model": "so101"}}, "leaders": {"lead": {"model": "so101_leader", "port": "/dev/lead"}}}
+    assert (find_arms(rig), [arm.name for arm in find_leaders(rig)]) == ([], ["lead"])
+    with pytest.raises(ConfigError, match=r"robots.arm.real.port: is missing"):
+        find_arms(rig | {"leaders": {}})
+
+
+class Follower:
+    """A leader that may follow, and an arm at :data:`Q`, from which it is away."""
+
+    def __init__(self, far: SteppedServos, leader: ServoLeader) -> None:
+        self.far, self.leader, self.now = far, leader, 1000.0
+        leader.open()
+
+    def run(self, turns: int, wanted: Sequence[float] | None = None, until: Callable[[], bool] = lambda: False) -> bool:
+        """Let it follow for some turns of 10 ms, at most until something is true, and return whether that is."""
+        for _ in range(turns):
+            self.leader.follow(wanted)
+            self.turn()
+            if until():
+                return True
+        return False
+
+    def turn(self) -> None:
+        """Let 10 ms pass."""
+        self.far.advance(0.01)
+        self.now += 0.01
+        self.leader.poll(self.now, 0.0)
+
+    def on(self) -> list[bool]:
+        return self.far.execute("state")["on"]
+
+
+@pytest.fixture
+def follower(far: SteppedServos) -> Iterator[Follower]:
+    with closing(so101_leader(far, follow=0.3, lever="deadman")) as driver:
+        yield Follower(far, driver)
+
+
+AWAY = [0.1, -0.2, 0.3, 0.4, -0.8]
+
+
+def test_a_leader_follows_the_arm_slowly_and_with_little_torque_and_is_let_go_at_once(follower: Follower) -> None:
+    follower.far.execute(f"hand 0.1 {' '.join(map(str, Q))}")
+    follower.run(100)
+    assert not any(follower.on()), "as long as no policy drives"
+    assert follower.run(20, AWAY, lambda: all(follower.on()[:-1]))
+    follower.run(150, AWAY)
+    state = follower.far.execute("state")
+    assert state["q"] == pytest.approx(AWAY, abs=0.1), "a weak motor sags"
+    assert state["limits"][:5] == [300] * 5
+    assert max(state["peak_speed"]) < 1.0
+    assert not state["on"][5], "the lever"
+    assert follower.leader.poll(follower.now, 0.0).joints == pytest.approx(state["q"], abs=0.01)
+    assert follower.run(2, None, lambda: not any(follower.on()))
+    follower.run(50)
+    assert follower.far.execute("state")["q"] == pytest.approx(state["q"], abs=0.02), "the hand holds it"
+    assert follower.run(20, Q, lambda: all(follower.on()[:-1]))
+    wait_until(lambda: follower.turn() is None and not any(follower.on()), "nobody gave it more to follow")
+
+
+def test_a_leader_is_let_go_when_it_is_closed_and_when_a_motor_is_silent(follower: Follower) -> None:
+    assert follower.run(20, AWAY, lambda: all(follower.on()[:-1]))
+    follower.far.execute("silent 2 on")
+    with patch.object(bus, "_ANSWER", 0.05):
+        assert follower.run(40, AWAY, lambda: follower.on() == [False, True, False, False, False, False])
+    follower.far.execute("silent 2 off")
+    assert follower.run(100, None, lambda: not any(follower.on())), "that motor, too, once it answers"
+    assert follower.run(60, AWAY, lambda: all(follower.on()[:-1]))
+    follower.leader.close()
+    assert not any(follower.on())
+
+
+def test_a_leader_that_may_not_follow_never_has_torque(far: SteppedServos, follower: Follower) -> None:
+    follower.far.execute("register 1 40 1")  # by another program
+    assert not follower.run(30, AWAY, lambda: follower.leader.poll(follower.now, 0.0).connected)
+    assert "shoulder_pan (motor 1) has torque" in follower.leader.describe()
+    with closing(so101_leader(far)) as driver:
+        follower.leader.close()
+        follower.far.execute("register 1 40 0")
+        other = Follower(far, driver)
+        assert not other.run(30, AWAY, lambda: any(other.on()))
+    with pytest.raises(ConfigError, match="leaders.lead.follow: needs a dead-man"):
+        so101_leader(far, follow=0.3)
+
+
+def test_an_emulated_leader_may_not_lead_a_real_arm(leader: ServoLeader) -> None:
     assert "no person holds it" in str(Leader(leader).distrust())
 
 

@@ -348,3 +348,21 @@ def test_lerobots_calibration_file_must_be_what_the_motors_hold(arm: Arm, tmp_pa
     file.write_text(json.dumps(content), encoding="utf-8")
     with closing(make(arm.far, options=options)) as driver, pytest.raises(ConfigError, match="elbow.*homing_offset"):
         driver.open()
+
+
+def test_the_check_counts_motors_and_names_an_adapter_that_collects_answers(
+    viperx: Arm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bus, "_ADAPTERS", tmp_path)
+    timer = tmp_path / Path(viperx.far.arm.port).resolve().name / "latency_timer"
+    timer.parent.mkdir()
+    timer.write_text("16\n")
+    viperx.far.execute("register 5 9 250")  # the second motor of the elbow
+    motors, delay, _, adapter, *_ = check(viperx.far.spec, 0.1)  # the third one is of the gripper
+    assert sum(map(int, re.findall(r"(\d+) XM", motors.found))) == 8, motors.found
+    assert delay.found.startswith("elbow (motor 5) ")
+    assert (adapter.level, adapter.found, adapter.remedy) == (
+        "warn",
+        "it collects answers for 16 ms",
+        f"echo 1 | sudo tee {timer}",
+    )

@@ -27,6 +27,8 @@ from hal.views import ACTIONS
 
 PAD = {"type": "pad", "seen": 12.5, "since": 20.0, "axes": [0.0, -1, 0.25, 1, 1, 0.0, -1.0, 1], "buttons": 64}
 
+HAND = {**PAD, "type": "hand", "pose": [0.1, -2, 3, 0, 0.6, 0, 0.8]}
+
 
 def take(text: str) -> object:
     return parse(text, robots=["panda"], cameras=["scene", "wrist"])
@@ -36,6 +38,7 @@ def take(text: str) -> object:
     ("message", "record"),
     [
         (PAD, PadMessage(12.5, 0.02, (0.0, -1.0, 0.25, 1.0, 1.0, 0.0, -1.0, 1.0), 64)),
+        (HAND, PadMessage(12.5, 0.02, (0.0, -1.0, 0.25, 1.0, 1.0, 0.0, -1.0, 1.0), 64, (0.1, -2, 3, 0, 0.6, 0, 0.8))),
         ({"type": "away", "why": "hidden"}, PageLeft("the page was hidden")),
         *(({"type": "lease", "take": take}, ControlRequest(take)) for take in (True, False)),
         ({"type": "stop"}, StopRequest()),
@@ -89,6 +92,12 @@ def with_axis(value: str) -> str:
         *map(with_axis, ["NaN", "Infinity", "-Infinity", "1e999", "1.001", "-1.001", "true", "null", '"0"', "[0]"]),
         *map(with_axis, ["9" * 3000, "0.25, 0.25"]),
         *(json.dumps({**PAD, key: value}) for key, values in WRONG_FIELDS.items() for value in values),
+        *(
+            json.dumps({**HAND, "pose": wrong})
+            for wrong in ([], [0] * 7, [0] * 6 + [2], [200, 0, 0, 0, 0, 0, 1], [1] * 8)
+        ),
+        json.dumps({**PAD, "pose": HAND["pose"]}),
+        json.dumps({**PAD, "type": "hand"}),
         '{"type":"pad"}',
         '{"type":"stop","now":true}',
         '{"type":"stopp"}',

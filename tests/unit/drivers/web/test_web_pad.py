@@ -38,7 +38,7 @@ class Page:
 
     def send(self, t: float, mask: int = 0, **axes: float) -> None:
         values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in STICK_AXES]
-        message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask}
+        message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask, "pose": ()}
         self.queue.put(pad_reading(message, 0))
 
     def leave(self, t: float) -> None:

@@ -100,7 +100,7 @@ def test_only_the_pad_of_the_page_that_drives_counts(room: Room) -> None:
     room.now = 100.02
     room.pad(driver, 100.0, 20.0, [0.5, 0, 0, 0, 1, 0, 0, -1])
     axes = (0.5, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0)
-    pad = {"connected": True, "t": 100.02, "t_alive": 100.02, "axes": axes, "buttons": 0, "from": "page 1"}
+    pad = {"connected": True, "t": 100.02, "t_alive": 100.02, "axes": axes, "buttons": 0, "pose": (), "from": "page 1"}
     assert (room.app.news(), inbox(driver)) == ([{"pad": pad}], [{"type": "beat", "t": 100.02}])
 
 

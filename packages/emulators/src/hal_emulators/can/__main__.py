@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-import time
 from collections.abc import Sequence
 
 try:
@@ -13,14 +12,15 @@ try:
 except ModuleNotFoundError:
     sys.exit("error: python-can is not installed: pip install 'robot-hal[can]'")
 
-from hal.errors import ControlTaken, HalError
+from hal.errors import ControlTaken
 from hal.lock import DeviceLock
-from hal_emulators.control import CommandPort, add_rig_options, note_signals, serve_prompt
+from hal_emulators.control import Started, run_emulator
 from hal_emulators.shared_world import has_world, run_world
 
 from .console import help_text
 from .server import CanEmulator
 
+_WHAT = "Emulates every arm on a CAN bus in a rig: Damiao motors or a PiPER, with mass, gravity and friction."
 _PATIENCE = 1.0
 """s for which an emulator waits for one that is ending."""
 _locks: list[DeviceLock] = []
@@ -29,43 +29,27 @@ _locks: list[DeviceLock] = []
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="hal emulate can",
-        description="Emulates every arm on a CAN bus in a rig: Damiao motors or a PiPER, with mass, gravity and "
-        "friction. What the manuals leave open is assumed; it proves nothing about a real arm.",
-        epilog="commands, typed here or sent to the control port; with several arms, the arm's name first:\n"
-        + help_text(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_rig_options(parser)
-    options = parser.parse_args(arguments)
-    ends = note_signals()
+    return run_emulator("can", _WHAT, help_text(), arguments, _start)
+
+
+def _start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Started:
     try:
-        _run(options, ends)
-    except (HalError, can.CanError, OSError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-def _run(options: argparse.Namespace, ends: list[int]) -> None:
-    with contextlib.ExitStack() as stack:
         in_world = not options.no_world and has_world(options.config, options.set)
         if in_world:
             stack.enter_context(run_world(options.config, options.set))
-        built = CanEmulator(options.config, options.set, options.seed, realtime=True, in_world=in_world)
-        _lock_buses(built)
-        with built as emulator:
-            port = CommandPort(emulator.execute, options.port)
-            names = ", ".join(f"{arm.name} at {' '.join(arm.bus.key)}" for arm in emulator.arms.values())
-            print(f"ready: {names}; control port {port.number}; help lists the commands", flush=True)
-            serve_prompt(emulator.execute)
-            while not ends:
-                time.sleep(0.1)
-                for bus in emulator.buses:
-                    if bus.error is not None:
-                        raise bus.error
-            port.close()
+        emulator = CanEmulator(options.config, options.set, options.seed, realtime=True, in_world=in_world)
+        _lock_buses(emulator)
+        stack.enter_context(emulator)
+    except can.CanError as error:
+        raise ValueError(str(error)) from None
+
+    def check() -> None:
+        for bus in emulator.buses:
+            if bus.error is not None:
+                raise ValueError(str(bus.error))
+
+    places = ", ".join(f"{arm.name} at {' '.join(arm.bus.key)}" for arm in emulator.arms.values())
+    return Started(emulator.execute, places, check)
 
 
 def _lock_buses(emulator: CanEmulator) -> None:

@@ -6,19 +6,18 @@ this computer only; a line holds a command, and its answer is a line of JSON.
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from hal_emulators.control import read_switch
+from hal_emulators.control import read_end, read_number, read_switch
 
 from .server import CanEmulator, EmulatedArm, EmulatedBus
 
-_FOREVER = 1e9
-"""Stands for no end, s."""
+_MOST = 1e4
+"""Greatest number of a command, in SI units."""
 
 
 class _Target(NamedTuple):
@@ -39,18 +38,6 @@ class EmulatorCommand(NamedTuple):
 
 
 # Values of a command. A wrong one is a ValueError, in words.
-
-
-def _float(word: str, what: str, least: float | None = None) -> float:
-    """Return a number; ``what`` names it and its unit."""
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or (least is not None and value < least):
-        bound = "" if least is None else f" of at least {least:g}"
-        raise ValueError(f"{what} must be a number{bound}, not {word!r}")
-    return value
 
 
 def _int(word: str, what: str, least: int, most: int, base: int = 0) -> int:
@@ -77,16 +64,6 @@ def _motor(target: _Target, word: str, other: str = "") -> int:
     return number
 
 
-def _parse_end(word: str) -> float:
-    """Return the time at which a fault ends, s on the monotonic clock."""
-    if word in ("on", "off"):
-        return time.monotonic() + _FOREVER if word == "on" else 0.0
-    try:
-        return time.monotonic() + _float(word, "S", 0.0)
-    except ValueError:
-        raise ValueError(f"takes a time in s, on or off, not {word!r}") from None
-
-
 # Faults of the bus.
 
 
@@ -96,14 +73,11 @@ def _lose(target: _Target, words: list[str]) -> None:
         motor = _motor(target, words[2]) if len(words) > 2 else 0
         faults.lose_next[motor] = _int(words[1], "the number of replies", 0, 1_000_000)
     else:
-        share = _float(words[0], "the share of the replies", 0.0)
-        if share > 1.0:
-            raise ValueError(f"the share of the replies must be 0 to 1, not {words[0]}")
-        faults.lost_share = share
+        faults.lost_share = read_number(words[0], 0.0, 1.0)
 
 
 def _late(target: _Target, words: list[str]) -> None:
-    target.bus.faults[target.arm.name].delay = _float(words[0], "the delay in s", 0.0)
+    target.bus.faults[target.arm.name].delay = read_number(words[0], 0.0, _MOST)
 
 
 def _double(target: _Target, words: list[str]) -> None:
@@ -112,11 +86,11 @@ def _double(target: _Target, words: list[str]) -> None:
 
 def _silent(target: _Target, words: list[str]) -> None:
     number = 0 if words[0] == "all" else _motor(target, words[0], "or all")
-    target.bus.faults[target.arm.name].silent_until[number] = _parse_end(words[1])
+    target.bus.faults[target.arm.name].silent_until[number] = read_end(words[1])
 
 
 def _cut(target: _Target, words: list[str]) -> None:
-    target.bus.cut_until = _parse_end(words[0])
+    target.bus.cut_until = read_end(words[0])
 
 
 def _frame(target: _Target, words: list[str]) -> None:
@@ -133,7 +107,7 @@ def _frame(target: _Target, words: list[str]) -> None:
 
 
 def _stall(target: _Target, words: list[str]) -> None:
-    target.bus.stall = _float(words[0], "the time in s", 0.0)
+    target.bus.stall = read_number(words[0], 0.0, _MOST)
 
 
 # Faults of motors.
@@ -146,7 +120,7 @@ def _status(target: _Target, words: list[str]) -> None:
 
 
 def _register(target: _Target, words: list[str]) -> None:
-    target.arm.set_register(_motor(target, words[0]), words[1], _float(words[2], "the value", 0.0))
+    target.arm.set_register(_motor(target, words[0]), words[1], read_number(words[2], 0.0, 1e9))
 
 
 def _temperature(target: _Target, words: list[str]) -> None:
@@ -158,23 +132,23 @@ def _temperature(target: _Target, words: list[str]) -> None:
 
 
 def _masses(target: _Target, words: list[str]) -> None:
-    target.arm.plant.load(mass_factor=_float(words[0], "the factor", 0.0))
+    target.arm.plant.load(mass_factor=read_number(words[0], 0.0, _MOST))
 
 
 def _friction(target: _Target, words: list[str]) -> None:
-    target.arm.plant.friction = _float(words[0], "the factor", 0.0)
+    target.arm.plant.friction = read_number(words[0], 0.0, _MOST)
 
 
 def _payload(target: _Target, words: list[str]) -> None:
-    mass = _float(words[0], "the mass in kg", 0.0)
-    place = [_float(word, "X, Y and Z in m") for word in words[1:]]
+    mass = read_number(words[0], 0.0, _MOST)
+    place = [read_number(word, -_MOST, _MOST) for word in words[1:]]
     if len(place) not in (0, 3):
         raise IndexError
     target.arm.plant.load(payload=(mass, place or (0.0, 0.0, 0.0)))
 
 
 def _place(target: _Target, words: list[str]) -> None:
-    q = [_float(word, "a position in rad") for word in words] or target.arm.plant.q.tolist()
+    q = [read_number(word, -_MOST, _MOST) for word in words] or target.arm.plant.q.tolist()
     if len(q) != len(target.arm.plant.q):
         raise ValueError(f"takes {len(target.arm.plant.q)} positions in rad, or none for the present ones")
     target.arm.restart()
@@ -184,13 +158,13 @@ def _place(target: _Target, words: list[str]) -> None:
 
 def _push(target: _Target, words: list[str]) -> None:
     joint = _int(words[0], "the joint", 1, len(target.arm.plant.push))
-    target.arm.plant.push[joint - 1] = _float(words[1], "the torque in Nm")
+    target.arm.plant.push[joint - 1] = read_number(words[1], -_MOST, _MOST)
 
 
 def _object(target: _Target, words: list[str]) -> None:
     if target.arm.world is not None:
         raise ValueError("the fingers meet the objects of the simulated world: use rig.world, or --no-world")
-    target.arm.set_object(None if words[0] == "none" else _float(words[0], "the width in m", 0.0))
+    target.arm.set_object(None if words[0] == "none" else read_number(words[0], 0.0, _MOST))
 
 
 # Reports.

@@ -7,21 +7,20 @@ import gc
 import ipaddress
 import sys
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hal.config.data_files import find_data
 from hal.drivers.franka.limits import LIMITS
 from hal.errors import HalError
-from hal_emulators.control import CONTROL_PORT, note_signals
+from hal_emulators.control import CONTROL_PORT, CommandPort, note_signals, serve_prompt
 from hal_emulators.shared_world import ArmInWorld, enter_world, find_arm
 
 from .arm import EmulatedArm, RobotFiles
-from .console import CommandConsole, Executor
+from .console import Executor
 from .faults import help_text
 from .journal import Journal
 from .model_library import write_model_library
-from .plant import IdealPlant, LaggingPlant, Plant, PyBulletPlant, RigidBody, arm_only
+from .plant import IdealPlant, LaggingPlant, RigidBody, arm_only
 from .protocol import PORT, PROTOCOLS
 from .server import ArmServer, Pacing
 
@@ -56,11 +55,10 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
     """Return the server, ready to run, and the line that announces it. Raises OSError and ValueError."""
     title, model, version = _ROBOTS[options.robot]
     world = _enter_world(options, stack)
-    urdf = options.urdf or find_data("robots", f"{options.robot}.urdf")
+    urdf = find_data("robots", f"{options.robot}.urdf")
     bare = arm_only(urdf.read_text(encoding="utf-8"))
     files = RobotFiles(bare.encode(), write_model_library(bare) if version == 5 else b"")
-    plant = _plant(options, urdf)
-    stack.callback(plant.close)
+    plant = (LaggingPlant if options.plant == "lag" else IdealPlant)(RigidBody(urdf), options.q)
     with_hand = options.end_effector == "hand"
     arm = EmulatedArm(PROTOCOLS[version], LIMITS[model], plant, journal, with_hand)
     pacing = Pacing(options.lockstep, not (options.lockstep and options.unpaced), options.patience)
@@ -73,9 +71,10 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
         stack.callback(hand.stop)
     # Fault commands are accepted from this computer only.
     control_host = options.host if ipaddress.ip_address(options.host).is_loopback else "127.0.0.1"
-    console = CommandConsole(control_host, server.poller, Executor(server, hand).execute)
-    stack.callback(console.close)
-    server.attach(console.serve)
+    executor = Executor(server, hand)
+    port = CommandPort(executor.execute_line, CONTROL_PORT, control_host)
+    stack.callback(port.close)
+    serve_prompt(executor.execute_line)
     hands = "no hand" if hand is None else f"hand {PORT + 1}"
     return server, (
         f"ready: {title} at {options.host}, arm {PORT}, {hands}, control {control_host}:{CONTROL_PORT}; "
@@ -94,10 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--robot", choices=sorted(_ROBOTS), default="fr3", help="which arm (%(default)s)")
     add("--host", default="127.0.0.2", type=_address, help="address to listen on; the ports are fixed (%(default)s)")
-    add(
-        "--plant", choices=("ideal", "lag", "pybullet"), default="ideal", help="model of the arm's motion (%(default)s)"
-    )
-    add("--lag", type=_positive, default=0.01, metavar="S", help="time constant of --plant lag, s (%(default)s)")
+    add("--plant", choices=("ideal", "lag"), default="ideal", help="motion: exact, or 10 ms late (%(default)s)")
     add("--lockstep", action="store_true", help="during a motion, wait for the answer to each state")
     add(
         "--unpaced",
@@ -112,7 +108,6 @@ def _parser() -> argparse.ArgumentParser:
         help="with --lockstep: longest wait for an answer, s (%(default)s)",
     )
     add("--q", type=float, nargs=7, default=_HOME, metavar="RAD", help="joint positions at the start (home)")
-    add("--urdf", type=Path, help="the arm's URDF (the project's own)")
     add("--end-effector", choices=("hand", "none"), default="hand", help="tool on the flange (%(default)s)")
     add(
         "--config",
@@ -124,15 +119,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
     add("--quiet", action="store_true", help="print no events")
     return parser
-
-
-def _plant(options: argparse.Namespace, urdf: Path) -> Plant:
-    body = RigidBody(urdf)
-    if options.plant == "lag":
-        return LaggingPlant(body, options.q, options.lag)
-    if options.plant == "pybullet":
-        return PyBulletPlant(body, urdf, options.q)
-    return IdealPlant(body, options.q)
 
 
 def _hand(options: argparse.Namespace, world: ArmInWorld | None) -> Any:

@@ -1,124 +1,22 @@
-"""Command console of the emulator: standard input and a control port, and what each command does.
-
-The control port listens on a loopback address; its clients send lines of JSON or plain words. The table of commands is
-in :mod:`.faults`.
-"""
+"""What each command of the emulator does, from its prompt or its control port; their table is in :mod:`.faults`."""
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
-import select
 import signal
-import socket
-import stat
-import sys
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
 from hal.drivers.franka.flags import flag_index
-from hal_emulators.control import CONTROL_PORT, answer_line, read_switch, read_words
+from hal_emulators.control import read_number, read_switch, read_words
 
 from .faults import COMMANDS, help_text
 from .journal import Counters
-from .server import ArmServer, listen
+from .server import ArmServer
 
 Words = list[str]
 Answer = dict[str, Any]
-
-_MAX_LINE = 4096
-"""Largest size of a line, bytes."""
-
-Execute = Callable[[list[str]], dict[str, Any]]
-
-
-class CommandConsole:
-    """Reads lines, executes them, and answers, all in :meth:`serve` and in the caller's thread.
-
-    A line on the control port is a JSON object ``{"command": ["reflex", "joint_reflex"]}`` or the words themselves;
-    its answer is a JSON object with ``ok``, and ``error`` where that is false.
-    """
-
-    def __init__(self, host: str, poller: select.epoll, execute: Execute) -> None:
-        """Raises OSError if the port is in use."""
-        self._poller = poller
-        self._execute = lambda line: execute(read_words(line))
-        self._listener = listen(host, CONTROL_PORT)
-        self._connections: dict[int, socket.socket] = {}
-        self._unfinished: dict[int, bytes] = {}
-        poller.register(self._listener, select.EPOLLIN)
-        self._stdin = _readable_stdin()
-        if self._stdin is not None:
-            poller.register(self._stdin, select.EPOLLIN)
-
-    def serve(self, descriptor: int) -> None:
-        """Process the input of a descriptor that is ready."""
-        if descriptor == self._listener.fileno():
-            with contextlib.suppress(OSError):
-                connection, _ = self._listener.accept()
-                connection.settimeout(1.0)
-                self._connections[connection.fileno()] = connection
-                self._poller.register(connection, select.EPOLLIN)
-        elif descriptor == self._stdin:
-            self._serve_stdin(descriptor)
-        elif descriptor in self._connections:
-            self._serve_connection(descriptor)
-
-    def _serve_connection(self, descriptor: int) -> None:
-        connection = self._connections[descriptor]
-        try:
-            lines = self._lines(descriptor, connection.recv(_MAX_LINE))
-            for line in lines:
-                connection.sendall(json.dumps(answer_line(self._execute, line)).encode() + b"\n")
-        except (OSError, EOFError):
-            self._poller.unregister(connection)
-            del self._connections[descriptor]
-            self._unfinished.pop(descriptor, None)
-            connection.close()
-
-    def _serve_stdin(self, descriptor: int) -> None:
-        try:
-            if os.isatty(descriptor) and os.tcgetpgrp(descriptor) != os.getpgrp():
-                raise EOFError  # in the background: reading the terminal would stop this process
-            lines = self._lines(descriptor, os.read(descriptor, _MAX_LINE))
-        except (OSError, EOFError):
-            self._poller.unregister(descriptor)
-            self._stdin = None
-            return
-        for line in lines:
-            answer = answer_line(self._execute, line)
-            text = answer.get("text") or json.dumps(answer, indent=2)
-            with contextlib.suppress(OSError, ValueError):
-                print(text, flush=True)
-
-    def _lines(self, descriptor: int, data: bytes) -> list[str]:
-        """Return the complete lines. Raises EOFError at the end, and for a line that is too long."""
-        received = self._unfinished.get(descriptor, b"") + data
-        *lines, rest = received.split(b"\n")
-        if not data or len(rest) > _MAX_LINE:
-            raise EOFError
-        self._unfinished[descriptor] = rest
-        return [line.decode(errors="replace").strip() for line in lines if line.strip()]
-
-    def close(self) -> None:
-        """Close the port."""
-        for connection in (self._listener, *self._connections.values()):
-            connection.close()
-
-
-def _readable_stdin() -> int | None:
-    """Return the descriptor of standard input if it is a terminal, a pipe or a socket."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        descriptor = sys.stdin.fileno()
-        kind = os.fstat(descriptor).st_mode
-        if os.isatty(descriptor) or stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind):
-            return descriptor
-    return None
-
-
-# Commands.
 
 _MAX_DURATION = 600.0
 """Longest duration of a fault, s."""
@@ -168,6 +66,11 @@ class Executor:
             "help": lambda words: {"text": help_text()},
         }
 
+    def execute_line(self, line: str) -> Answer:
+        """Execute a command between two cycles of the server, and return its answer. Raises ValueError."""
+        words = read_words(line)
+        return self._server.call(lambda: self.execute(words))
+
     def execute(self, words: Words) -> Answer:
         """Execute a command, and return its answer. Raises ValueError if it is invalid."""
         verb, *rest = words or [""]
@@ -192,10 +95,7 @@ class Executor:
         reports.lag = int(word)
 
     def _report_noise(self, words: Words) -> None:
-        (word,) = _exactly(words, 1)
-        if not 0.0 <= float(word) <= 1.0:
-            raise ValueError("takes 0 to 1 rad")
-        self._server.arm.reports.noise = float(word)
+        self._server.arm.reports.noise = read_number(_exactly(words, 1)[0], 0.0, 1.0)
 
     def _report_measured(self, words: Words) -> None:
         self._server.arm.reports.measured = read_switch(*_exactly(words, 1))
@@ -272,8 +172,4 @@ def _exactly(words: Words, count: int) -> Words:
 
 
 def _seconds(words: Words) -> float:
-    (word,) = _exactly(words, 1)
-    seconds = float(word)
-    if not 0.0 <= seconds <= _MAX_DURATION:
-        raise ValueError(f"takes 0 to {_MAX_DURATION:g} seconds")
-    return seconds
+    return read_number(_exactly(words, 1)[0], 0.0, _MAX_DURATION)

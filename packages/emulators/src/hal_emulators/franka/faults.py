@@ -1,6 +1,6 @@
 """Faults of the robot and its network that can be injected, and the table of commands.
 
-Commands are typed into the emulator's standard input, or sent to its control port (see :mod:`.control`).
+Commands are typed into the emulator's standard input, or sent to its control port (see :mod:`hal_emulators.control`).
 """
 
 from __future__ import annotations

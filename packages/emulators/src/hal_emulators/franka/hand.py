@@ -1,15 +1,11 @@
 """Emulated Franka Hand: Franka's own client library talks to it as to the hand.
 
 It answers on TCP 1338 and sends states by UDP, from a thread of its own that sleeps nearly all of the time, so it can
-run beside the arm's loop. On its own: ``python -m hal_emulators.franka.hand --host 127.0.0.2``.
+run beside the arm's loop.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import socketserver
-import sys
 import threading
 import time
 from collections import deque
@@ -17,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from hal_emulators.control import answer_line, read_switch, read_words
+from hal_emulators.control import read_number, read_switch
 from hal_emulators.shared_world import ArmInWorld
 
 from .hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
@@ -75,14 +71,6 @@ class HandFaults:
     """Delay of every answer, s."""
     failures: int = 0
     """Number of motions that fail from now on."""
-
-
-def number(word: str, least: float = 0.0, most: float = 1e6) -> float:
-    """Return a word as a number in a range. Raises ValueError if it is not."""
-    value = float(word)
-    if not least <= value <= most:
-        raise ValueError(f"must be a number in {least:g}..{most:g}, not {word}")
-    return value
 
 
 # The hand.
@@ -194,7 +182,7 @@ class HandServer:
     def _do_object(self, width: str) -> None:
         if self._world is not None:
             raise ValueError("the fingers meet the objects of the simulated world: use rig.world")
-        self.fingers.put(None if width == "none" else number(width, 1e-6, FULL_WIDTH))
+        self.fingers.put(None if width == "none" else read_number(width, 1e-6, FULL_WIDTH))
 
     def _do_grasp_ends_at_width(self, word: str) -> None:
         self.fingers.grasp_ends_at_width = read_switch(word)
@@ -209,25 +197,25 @@ class HandServer:
         self.faults.stop_releases = read_switch(word)
 
     def _do_silence(self, seconds: str) -> None:
-        self.faults.silent_until = time.monotonic() + number(seconds)
+        self.faults.silent_until = time.monotonic() + read_number(seconds, 0.0, 1e6)
 
     def _do_slow_reply(self, seconds: str) -> None:
-        self.faults.slow_reply = number(seconds)
+        self.faults.slow_reply = read_number(seconds, 0.0, 1e6)
 
     def _do_fail(self, times: str = "1") -> None:
-        self.faults.failures = int(number(times))
+        self.faults.failures = int(read_number(times, 0.0, 1e6))
 
     def _do_version(self, version: str) -> None:
-        self.faults.version = int(number(version, 0, 65535))
+        self.faults.version = int(read_number(version, 0, 65535))
 
     def _do_temperature(self, degrees: str) -> None:
-        self.faults.temperature = int(number(degrees, 0, 65535))
+        self.faults.temperature = int(read_number(degrees, 0, 65535))
 
     def _do_drop(self) -> None:
         self._network.disconnect()
 
     def _do_restart(self, seconds: str = _RESTART) -> None:
-        self._back_at = time.monotonic() + number(seconds)
+        self._back_at = time.monotonic() + read_number(seconds, 0.0, 1e6)
         self._network.shut()
         self._running = None
         self.fingers.switch_off()
@@ -347,60 +335,3 @@ def _motion(request: HandRequest) -> FingerMotion:
         width, inner, outer, speed, force = values
         return FingerMotion(FingerMotionKind.GRASP, width, speed, force, inner, outer)
     return FingerMotion(FingerMotionKind.HOMING)
-
-
-# The program.
-
-HAND_CONTROL_PORT = 1340
-"""TCP; lines as on the arm's control port (:mod:`.console`): words, or ``{"command": ["object", "0.03"]}``."""
-
-
-class _ControlHandler(socketserver.StreamRequestHandler):
-    server: _ControlServer
-
-    def handle(self) -> None:
-        for line in self.rfile:
-            self.wfile.write(json.dumps(_execute(self.server.hand, line.decode(errors="replace"))).encode() + b"\n")
-
-
-class _ControlServer(socketserver.ThreadingTCPServer):
-    allow_reuse_address = True
-    daemon_threads = True
-
-    def __init__(self, hand: HandServer, host: str) -> None:
-        self.hand = hand
-        super().__init__((host, HAND_CONTROL_PORT), _ControlHandler)
-
-
-def _execute(hand: HandServer, line: str) -> dict[str, Any]:
-    return answer_line(lambda line: hand.command(read_words(line.strip())), line)
-
-
-def main() -> None:
-    """Run the hand alone, until standard input ends."""
-    parser = argparse.ArgumentParser(description="Emulates a Franka Hand for the vendor's own client library.")
-    parser.add_argument("--host", default="127.0.0.2", help="address to listen on (%(default)s)")
-    parser.add_argument("--object", type=float, metavar="W", help="object of W m between the fingers")
-    parser.add_argument("--period", type=float, default=0.02, metavar="S", help="s between states (%(default)s)")
-    parser.add_argument("--unhomed", action="store_true", help="not homed, as after switching on")
-    arguments = parser.parse_args()
-    hand = HandServer(
-        arguments.host, object_width=arguments.object, period=arguments.period, homed=not arguments.unhomed
-    )
-    hand.start()
-    control = _ControlServer(hand, arguments.host)
-    threading.Thread(target=control.serve_forever, daemon=True).start()
-    print(
-        f"ready: Franka Hand at {arguments.host}; "
-        f"type commands here, or send them to port {HAND_CONTROL_PORT}; help lists them",
-        flush=True,
-    )
-    for line in sys.stdin:
-        answer = _execute(hand, line)
-        print(answer.get("text") or json.dumps(answer), flush=True)
-    control.shutdown()
-    hand.stop()
-
-
-if __name__ == "__main__":
-    main()

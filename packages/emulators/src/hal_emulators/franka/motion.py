@@ -10,7 +10,7 @@ import struct
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import copysign, isfinite, sqrt
+from math import isfinite
 from typing import NamedTuple
 
 from hal.drivers.franka.flags import flag_index
@@ -239,7 +239,6 @@ class LimitChecker:
 
 _MODES = struct.Struct("<II")
 _DEVIATIONS = struct.Struct("<6d")
-_SPEEDS = struct.Struct("<7d")
 _ASYNCHRONOUS = _MODES.size + _DEVIATIONS.size
 """Size of a Move in protocol 5; in protocol 10 more fields follow."""
 
@@ -249,17 +248,12 @@ class MoveOptions(NamedTuple):
 
     controller: Controller
     generator: Generator
-    asynchronous: bool = False
-    """Targets arrive at any rate, and the robot generates the motion between them."""
-    speeds: Floats = (0.0,) * 7
-    """Speeds of the asynchronous generator (7,), rad/s."""
 
     def describe(self) -> str:
         """Return a short description."""
         if self.generator is Generator.NONE:
             return "torques"
-        words = f"{self.generator.name}, {self.controller.name}".lower().replace("_", " ")
-        return words + (", asynchronous" if self.asynchronous else "")
+        return f"{self.generator.name}, {self.controller.name}".lower().replace("_", " ")
 
 
 def read_move(payload: bytes) -> MoveOptions:
@@ -270,14 +264,9 @@ def read_move(payload: bytes) -> MoveOptions:
         raise ValueError("a deviation is not finite")
     if generator is Generator.NONE and controller is not Controller.EXTERNAL:
         raise ValueError("neither positions nor torques")
-    if len(payload) == _ASYNCHRONOUS:
-        return MoveOptions(controller, generator)
-    asynchronous, speeds = payload[_ASYNCHRONOUS] != 0, _SPEEDS.unpack_from(payload, _ASYNCHRONOUS + 1)
-    if asynchronous and (generator is not Generator.JOINT_POSITION or controller is Controller.EXTERNAL):
-        raise ValueError("only joint positions can be asynchronous")
-    if asynchronous and not all(isfinite(speed) and speed > 0.0 for speed in speeds):
-        raise ValueError("a speed that is not above 0")
-    return MoveOptions(controller, generator, asynchronous, speeds)
+    if any(payload[_ASYNCHRONOUS : _ASYNCHRONOUS + 1]):
+        raise ValueError("asynchronous motions are not emulated")
+    return MoveOptions(controller, generator)
 
 
 # The motion.
@@ -286,8 +275,6 @@ LOST_LIMIT = 20
 """Consecutive lost commands that end a motion."""
 _RATED = 100
 """Cycles that the success rate covers."""
-_APPROACH = 20.0
-"""Gain of the asynchronous generator, 1/s. An assumption, like its whole profile."""
 _COMMUNICATION = flag_index("communication_constraints_violation")
 
 
@@ -321,7 +308,6 @@ class EmulatedMotion:
         self.lost_in_row = 0
         self.commands = 0
         self._checker = checker
-        self._target: Floats = start.q
         self._in_time = deque([1] * _RATED, _RATED)
         self._successes = _RATED
 
@@ -334,11 +320,7 @@ class EmulatedMotion:
         """Advance one cycle, with the arm at ``q`` (7,), rad; return the ending once the motion ends."""
         if command is not None:
             return self._apply(command, q)
-        if self.options.asynchronous:
-            self._chase()
-        elif not self.waiting:
-            return self._miss()
-        return None
+        return None if self.waiting else self._miss()
 
     def _apply(self, command: CommandPacket, q: Floats) -> Ending | None:
         self._count(1)
@@ -358,10 +340,6 @@ class EmulatedMotion:
     def _generate(self, command: CommandPacket, q: Floats) -> Violation | None:
         generator = self.options.generator
         if generator is Generator.NONE:
-            return None
-        if self.options.asynchronous:
-            self._target = command.q
-            self._chase()
             return None
         if generator is Generator.JOINT_POSITION:
             if self.waiting:
@@ -385,16 +363,6 @@ class EmulatedMotion:
         if self.options.generator is not Generator.NONE:
             self.sample = extrapolate(self.sample)
         return None
-
-    def _chase(self) -> None:
-        """Advance the asynchronous generator one cycle towards the target, within speed and acceleration."""
-        speeds = []
-        for k, target in enumerate(self._target):
-            way, most = target - self.sample.q[k], self._checker.limits.acceleration[k]
-            speed = min(self.options.speeds[k], _APPROACH * abs(way), sqrt(most * abs(way)))
-            change = copysign(speed, way) - self.sample.dq[k]
-            speeds.append(self.sample.dq[k] + max(-most * DT, min(most * DT, change)))
-        self.sample = step_velocity(self.sample, speeds)
 
     def _count(self, success: int) -> None:
         self._successes += success - self._in_time[0]

@@ -6,7 +6,6 @@ Kinematics and dynamics are computed by pinocchio from a URDF, in which the hand
 from __future__ import annotations
 
 import re
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from abc import ABC, abstractmethod
 from math import exp, sqrt
@@ -138,9 +137,6 @@ class Plant(ABC):
         gravity = self.body.torques(self.q, (0.0,) * 7, (0.0,) * 7)
         self.tau = [a + b for a, b in zip(gravity, torques, strict=True)]
 
-    def close(self) -> None:  # noqa: B027  # optional
-        """Release resources."""
-
 
 class IdealPlant(Plant):
     """Follows the desired motion exactly."""
@@ -163,12 +159,14 @@ class IdealPlant(Plant):
         super().push(torques)
 
 
-class LaggingPlant(Plant):
-    """Follows with a first-order lag of ``lag`` s, roughly like a stiff joint controller."""
+_LAG = 0.01
+"""Time constant, s."""
 
-    def __init__(self, body: RigidBody, q: Floats, lag: float) -> None:
-        super().__init__(body, q)
-        self._share = 1.0 - exp(-DT / lag)
+
+class LaggingPlant(Plant):
+    """Follows with a first-order lag of 10 ms, roughly like a stiff joint controller."""
+
+    _share = 1.0 - exp(-DT / _LAG)
 
     def follow(self, desired: MotionSample) -> None:
         before, speed = self.q, self.dq
@@ -176,87 +174,6 @@ class LaggingPlant(Plant):
         self.dq = [(new - old) / DT for new, old in zip(self.q, before, strict=True)]
         ddq = [(new - old) / DT for new, old in zip(self.dq, speed, strict=True)]
         self.tau = self.body.torques(self.q, self.dq, ddq)
-
-
-_GAIN = 0.072
-"""Share of the position error that a motor corrects per step; with much more a loaded arm vibrates."""
-_TORQUE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
-
-
-class PyBulletPlant(Plant):
-    """An arm in PyBullet: position control by its motors, torque control by torques on top of gravity.
-
-    A motor is a velocity constraint with a torque limit. Collisions are ignored, and meshes not loaded.
-    """
-
-    def __init__(self, body: RigidBody, urdf: Path, q: Floats) -> None:
-        """Raises ValueError if PyBullet is missing or cannot load the URDF."""
-        super().__init__(body, q)
-        try:
-            import pybullet
-        except ImportError:
-            raise ValueError("--plant pybullet needs PyBullet: pip install 'robot-hal[sim]'") from None
-        self._bullet: Any = pybullet
-        pybullet.connect(pybullet.DIRECT)
-        pybullet.setTimeStep(DT)
-        pybullet.setGravity(0.0, 0.0, -9.81)
-        self._arm = self._load(urdf)
-        count = pybullet.getNumJoints(self._arm)
-        names = {pybullet.getJointInfo(self._arm, k)[1].decode(): k for k in range(count)}
-        self._joints = [next(k for name, k in names.items() if name.endswith(f"joint{n}")) for n in range(1, 8)]
-        for joint, damping in zip(self._joints, VISCOUS, strict=True):
-            pybullet.changeDynamics(self._arm, joint, jointDamping=damping, linearDamping=0.0, angularDamping=0.0)
-        self._motors_on = True
-        self.place(q)
-
-    def place(self, q: Floats) -> None:
-        super().place(q)
-        for joint, position in zip(self._joints, q, strict=True):
-            self._bullet.resetJointState(self._arm, joint, position)
-
-    def _load(self, urdf: Path) -> int:
-        bullet = self._bullet
-        with tempfile.NamedTemporaryFile("w", suffix=".urdf") as bare:
-            bare.write(remove_shapes(urdf.read_text(encoding="utf-8")))
-            bare.flush()
-            try:
-                arm: int = bullet.loadURDF(bare.name, useFixedBase=True, flags=bullet.URDF_USE_INERTIA_FROM_FILE)
-            except bullet.error as error:
-                raise ValueError(f"PyBullet cannot load {urdf}: {error}") from None
-        return arm
-
-    def follow(self, desired: MotionSample) -> None:
-        self._motors_on = True
-        self._bullet.setJointMotorControlArray(
-            self._arm,
-            self._joints,
-            self._bullet.POSITION_CONTROL,
-            [p - v * DT for p, v in zip(desired.q, desired.dq, strict=True)],
-            desired.dq,
-            _TORQUE,
-            [_GAIN] * 7,
-            [1.0] * 7,
-        )
-        self._step()
-
-    def push(self, torques: Floats) -> None:
-        bullet = self._bullet
-        if self._motors_on:
-            bullet.setJointMotorControlArray(self._arm, self._joints, bullet.VELOCITY_CONTROL, forces=[0.0] * 7)
-            self._motors_on = False
-        gravity = self.body.torques(self.q, (0.0,) * 7, (0.0,) * 7)
-        applied = [a + b for a, b in zip(gravity, torques, strict=True)]
-        bullet.setJointMotorControlArray(self._arm, self._joints, bullet.TORQUE_CONTROL, forces=applied)
-        self._step()
-        self.tau = applied
-
-    def _step(self) -> None:
-        self._bullet.stepSimulation()
-        states = self._bullet.getJointStates(self._arm, self._joints)
-        self.q, self.dq, _, self.tau = zip(*states, strict=True)
-
-    def close(self) -> None:
-        self._bullet.disconnect()
 
 
 # URDF.

@@ -6,14 +6,17 @@ In every cycle the server gathers the client's command, advances the arm and sen
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
 import struct
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import NamedTuple
+from queue import SimpleQueue
+from typing import Any, NamedTuple, TypeVar
 
 from hal_emulators.shared_world import ArmInWorld
 
@@ -22,6 +25,8 @@ from .faults import InjectedFaults
 from .journal import Counters
 from .motion import DT
 from .protocol import HEADER, PORT, CommandPacket, RequestOutcome, read_command
+
+T = TypeVar("T")
 
 # Timing.
 
@@ -216,7 +221,9 @@ class ArmServer:
         self._pacer = CyclePacer()
         self._listener = listen(host, PORT)
         self.poller.register(self._listener, select.EPOLLIN)
-        self._serve_other: Callable[[int], None] | None = None
+        self._calls: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+        self._called = os.eventfd(0)
+        self.poller.register(self._called, select.EPOLLIN)
         self._requests: deque[tuple[float, ArmRequest]] = deque()
         self._replies: list[ArmReply] = []
         self._command: CommandPacket | None = None
@@ -229,9 +236,12 @@ class ArmServer:
         self.world: ArmInWorld | None = None
         """The simulated world that the arm is in."""
 
-    def attach(self, serve: Callable[[int], None]) -> None:
-        """Pass descriptors that others registered with :attr:`poller` to ``serve`` once they are ready."""
-        self._serve_other = serve
+    def call(self, function: Callable[[], T]) -> T:
+        """Call a function between two cycles, and return what it does; not from the thread that serves."""
+        future: Future[T] = Future()
+        self._calls.put((function, future))
+        os.eventfd_write(self._called, 1)
+        return future.result()
 
     def run(self, ends: Sequence[object]) -> None:
         """Serve until something is in ``ends``."""
@@ -251,6 +261,7 @@ class ArmServer:
             self._end_session("the emulator ends")
         self._listener.close()
         self.poller.close()
+        os.close(self._called)
 
     def restart(self, away: float) -> None:
         """Restart as if switched off and on: drop the client, reset, and stay unreachable for ``away`` s."""
@@ -289,7 +300,7 @@ class ArmServer:
 
     def _waits_for_answers(self) -> bool:
         motion = self.arm.motion
-        if not self.pacing.lockstep or motion is None or motion.options.asynchronous:
+        if not self.pacing.lockstep or motion is None:
             return False
         return not motion.waiting or motion.states_shown >= _STATES_BEFORE
 
@@ -325,10 +336,18 @@ class ArmServer:
                 self._read_requests(session)
             elif descriptor == self._listener.fileno():
                 self._accept()
-            elif self._serve_other is not None:
-                self._serve_other(descriptor)
+            elif descriptor == self._called:
+                self._answer_call()
         while self._requests and self._requests[0][0] <= time.monotonic():
             self._handle(self._requests.popleft()[1])
+
+    def _answer_call(self) -> None:
+        for _ in range(os.eventfd_read(self._called)):
+            function, future = self._calls.get()
+            try:
+                future.set_result(function())
+            except Exception as error:
+                future.set_exception(error)
 
     def _receive(self, session: ArmClient) -> None:
         counters, motion = self.arm.counters, self.arm.motion
@@ -356,7 +375,7 @@ class ArmServer:
         """Return whether a command answers the last state; a motion's first command may answer any of its states."""
         motion = self.arm.motion
         assert motion is not None
-        if motion.waiting or motion.options.asynchronous:
+        if motion.waiting:
             return command.message_id > motion.begun_at
         return command.message_id == self.arm.message_id
 

@@ -55,10 +55,7 @@ class SoftwareCamera:
         return self._device is not None
 
     def attach(self, context: Any) -> None:
-        """Connect the camera to a context, now and at every ``replug``. Idempotent.
-
-        Use a context from :func:`.emulated_context`; for the limits of any other see :mod:`.device`.
-        """
+        """Connect the camera to an :func:`.emulated_context`, now and at every ``replug``. Idempotent."""
         if any(known is context for known in self._contexts):
             return
         self._contexts.append(context)

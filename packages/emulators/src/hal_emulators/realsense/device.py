@@ -3,9 +3,8 @@
 A software device that is added to a context is listed by the library, and announced to a callback that was set with
 ``set_devices_changed_callback``. It leaves the list when its last reference goes; but a pipeline keeps every device
 that it ever saw until it is deleted, and nothing announces that a device left (measured with 2.59, and so in its
-``src/context.cpp`` and ``src/device_hub.cpp``). So an emulated camera should be attached to an
-:func:`emulated_context`: an ``rs.context`` that hides unplugged cameras from its lists and announces their removal. In
-a plain ``rs.context`` an unplugged camera loses its serial number instead.
+``src/context.cpp`` and ``src/device_hub.cpp``). So an emulated camera is attached to an :func:`emulated_context`: an
+``rs.context`` that hides unplugged cameras from its lists and announces their removal.
 """
 
 from __future__ import annotations
@@ -281,7 +280,7 @@ def emulated_context() -> Any:
 
 
 class ContextEntry:
-    """A device's entry in a context, until it is removed."""
+    """A device's entry in an :func:`emulated_context`, until it is removed."""
 
     def __init__(self, context: Any, device: EmulatedDevice) -> None:
         self._context = context
@@ -289,19 +288,13 @@ class ContextEntry:
         # The library crashes on a device that is listed and deleted, so it lives for as long as the context.
         self._life = weakref.finalize(context, _drop_reference, device.native)
         self._life.atexit = False
-        # And its list drops a device without a reference.
-        if hasattr(context, "add_device"):
-            self._keeper = context.add_device(device)
-        else:
-            self._keeper = load_realsense().pipeline(context)
-            device.native.add_to(context)
+        self._keeper = context.add_device(device)  # its list drops a device without a reference
 
     def remove(self) -> None:
         """Unplug the device. Callbacks run in this thread."""
         self._keeper = None
         self._device.clear_serial()
-        if hasattr(self._context, "remove_device"):
-            self._context.remove_device(self._device)
+        self._context.remove_device(self._device)
 
     def release_if_unused(self) -> bool:
         """Release a removed device that the library no longer lists; return whether it did."""

@@ -5,51 +5,36 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-import time
 from collections.abc import Sequence
 
 from hal.config.loader import load
-from hal.errors import HalError
-from hal_emulators.control import CommandPort, add_rig_options, note_signals, serve_prompt
+from hal_emulators.control import Started, run_emulator
 from hal_emulators.shared_world import enter_world, has_world
 
 from .server import RobotiqEmulator, find_grippers, help_text
 
+_WHAT = (
+    "Emulates every Robotiq gripper of a rig, on a pseudo terminal with the name of its port, or on the text port of "
+    "its host."
+)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="hal emulate robotiq",
-        description="Emulates every Robotiq gripper of a rig, on a pseudo terminal with the name of its port, or on "
-        "the text port of its host. What the manual leaves open is assumed; it proves nothing about a real gripper.",
-        epilog="commands, typed here or sent to the control port; with several grippers, the arm's name first:\n"
-        + help_text(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_rig_options(parser)
-    options = parser.parse_args(arguments)
-    ends = note_signals()
-    try:
-        with contextlib.ExitStack() as stack:
-            emulator = RobotiqEmulator(find_grippers(options.config, options.set), options.seed, realtime=True)
-            if not options.no_world and has_world(options.config, options.set):
-                for robot in load(options.config, sim=False, overrides=options.set).resolve().robots:
-                    if robot.name in emulator.ports:
-                        emulator.ports[robot.name].gripper.in_world = True
-                        world = enter_world(stack, options.config, options.set, robot, role="fingers")
-                        emulator.worlds[robot.name] = world
-            stack.enter_context(emulator)
-            control = CommandPort(emulator.execute, options.port)
-            places = ", ".join(f"{arm} at {port.gripper.settings.place}" for arm, port in emulator.ports.items())
-            print(f"ready: {places}; control port {control.number}; help lists the commands", flush=True)
-            serve_prompt(emulator.execute)
-            while not ends:
-                time.sleep(0.1)
-            control.close()
-    except (HalError, OSError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return run_emulator("robotiq", _WHAT, help_text(), arguments, _start)
+
+
+def _start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Started:
+    emulator = RobotiqEmulator(find_grippers(options.config, options.set), options.seed, realtime=True)
+    if not options.no_world and has_world(options.config, options.set):
+        for robot in load(options.config, sim=False, overrides=options.set).resolve().robots:
+            if robot.name in emulator.ports:
+                emulator.ports[robot.name].gripper.in_world = True
+                world = enter_world(stack, options.config, options.set, robot, role="fingers")
+                emulator.worlds[robot.name] = world
+    stack.enter_context(emulator)
+    places = ", ".join(f"{arm} at {port.gripper.settings.place}" for arm, port in emulator.ports.items())
+    return Started(emulator.execute, places)
 
 
 if __name__ == "__main__":

@@ -92,6 +92,8 @@ class EmulatedArm:
         self._hand: deque[tuple[float, NDArray[np.float64]]] = deque()
         """Motions that a hand still makes: duration, s, and where they end: the joints, rad, then the lever, 0 to 1."""
         self._begun, self._t_hand = np.zeros(0), 0.0
+        self._in_hand = False
+        """Whether a hand is at it, which holds it as long as its motors have no torque."""
         self.place(spec.initial)
 
     def lead(self, seconds: float, end: Sequence[float]) -> None:
@@ -109,6 +111,7 @@ class EmulatedArm:
             raise ValueError(f"needs a duration, {count} angles and perhaps the lever")
         if any(servo.on for servo in self.servos):
             raise ValueError("its motors have torque: no hand moves it")
+        self._in_hand = True
         before = self._hand[-1][1] if self._hand else self._held
         self._hand.append((seconds, np.array([*end, *before[len(end) :]])))
 
@@ -158,8 +161,11 @@ class EmulatedArm:
         """Let ``dt`` s pass."""
         plant = self.plant
         drives = [_add([servo.drive(dt) for servo in servos]) for servos in self.joints]
-        if all(servo.on for servos in self.joints for servo in servos):
+        on = [servo.on for servos in self.joints for servo in servos]
+        if all(on):
             plant.held = False
+        elif self._in_hand and not any(on):
+            plant.held = True
         plant.step(dt, drives)
         if self._hand:
             self._move_by_hand(dt)

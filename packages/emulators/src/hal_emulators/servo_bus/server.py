@@ -22,7 +22,7 @@ from hal.config.loader import load
 from hal.drivers.servo_bus.protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer
 from hal.specs import RobotSpec
 from hal_emulators.control import read_end, read_switch
-from hal_emulators.shared_world import PRIORITY, raise_priority
+from hal_emulators.shared_world import PRIORITY, load_real, raise_priority
 from hal_emulators.terminal import PseudoTerminal
 
 from .arm import EmulatedArm
@@ -146,7 +146,7 @@ class ServoLine:
 
 def find_arms(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
     """Return the arms of a rig that this emulator can play. Raises ConfigError."""
-    return [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in SERVOS]
+    return [spec for spec in load_real(config, overrides).robots if spec.driver in SERVOS]
 
 
 def find_leaders(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:

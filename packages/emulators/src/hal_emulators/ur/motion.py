@@ -6,11 +6,13 @@ stand for it; ``gain`` has no effect, and the arm follows its trajectory with a 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pinocchio
 
 __all__ = ["ROBOTS", "TargetMotion", "forward", "parameters"]
 
@@ -53,36 +55,22 @@ def forward(dh: Vector, q: Sequence[float], tcp: Sequence[float]) -> Floats:
         q: Joint positions (6,), rad.
         tcp: The tcp in the frame of the flange: m, and a rotation vector, rad.
     """
-    pose = np.eye(4)
-    for angle, offset, a, d, alpha in zip(q, *dh.tolist(), strict=True):
-        c, s, ca, sa = math.cos(angle + offset), math.sin(angle + offset), math.cos(alpha), math.sin(alpha)
-        pose = pose @ np.array(
-            [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]]
-        )
-    tool = np.eye(4)
-    tool[:3, :3], tool[:3, 3] = _rotation(np.array(tcp[3:], float)), tcp[:3]
-    pose = pose @ tool
-    return [*pose[:3, 3].tolist(), *_vector(pose[:3, :3]).tolist()]
+    model, data, flange = _chain(dh.tobytes())
+    pinocchio.forwardKinematics(model, data, np.asarray(q, float))
+    tool = pinocchio.SE3(pinocchio.exp3(np.asarray(tcp[3:], float)), np.asarray(tcp[:3], float))
+    pose = data.oMi[model.njoints - 1] * flange * tool
+    return [*pose.translation.tolist(), *pinocchio.log3(pose.rotation).tolist()]
 
 
-def _rotation(vector: Vector) -> Vector:
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turned: Vector = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return turned
-
-
-def _vector(rotation: Vector) -> Vector:
-    from hal.geometry import matrix_to_quaternion
-
-    x, y, z, w = matrix_to_quaternion(rotation)
-    axis = np.array([x, y, z]) * (1.0 if w >= 0 else -1.0)
-    size = float(np.linalg.norm(axis))
-    turned: Vector = axis * (0.0 if size < 1e-12 else 2.0 * math.atan2(size, abs(w)) / size)
-    return turned
+@functools.lru_cache(maxsize=4)
+def _chain(dh: bytes) -> tuple[Any, Any, Any]:
+    """Return the model of the chain, data for it, and the flange in the frame of the last joint."""
+    model, after = pinocchio.Model(), pinocchio.SE3.Identity()
+    for k, (offset, a, d, alpha) in enumerate(np.frombuffer(dh).reshape(4, -1).T):
+        turn = pinocchio.SE3(pinocchio.utils.rotate("z", offset), np.zeros(3))
+        model.addJoint(k, pinocchio.JointModelRZ(), after * turn, f"joint{k}")
+        after = pinocchio.SE3(pinocchio.utils.rotate("x", alpha), np.array([a, 0.0, d]))
+    return model, model.createData(), after
 
 
 class TargetMotion:

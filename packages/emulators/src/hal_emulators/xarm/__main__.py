@@ -11,7 +11,12 @@ from hal_emulators.network_arm import help_text, run_program
 from .controller import ROBOTS, Controller
 from .server import COMMANDS, ORDERS, XArmServer
 
-HOMES = {"xarm7": (0.0, -0.2, 0.0, 0.806, 0.0, 1.007, 0.0), "xarm6": (0.0, -0.3, -1.2, 0.0, 1.5, 0.0)}
+HOMES = {
+    "xarm7": (0.0, -0.2, 0.0, 0.806, 0.0, 1.007, 0.0),
+    "xarm6": (0.0, -0.3, -1.2, 0.0, 1.5, 0.0),
+    "xarm5": (0.0, -0.3, -1.2, 1.5, 0.0),
+    "lite6": (0.0, 0.3, 1.2, 0.0, 0.9, 0.0),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,171 @@
+"""Driving with the hand controller of a headset, which Meta's emulator of WebXR (IWER, MIT) plays in the browser."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import subprocess
+import tarfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from .kit import Bench, Browser, wait_for
+from .moves import BRIEF, clear_trip, undisturbed
+
+IWER, DIGEST = "iwer@2.5.0", "23d8640949f19db4b1e70398b30e084e4aa555f3a81e4329da3fac1a70b39542"
+WEAR = """
+if (self === top) {
+  window.device = new IWER.XRDevice(IWER.metaQuest3);
+  device.installRuntime({ forceInstall: true }); // in place of the browser's own, which has no device
+  window.hand = device.controllers.right;
+  Object.assign(window, { blind: false, steady: false, speed: [0, 0, 0] }); // speed in m per picture
+  Object.defineProperty(XRPose.prototype, 'emulatedPosition', { get: () => blind });
+  let tremble = 1e-5;
+  const live = () => {
+    requestAnimationFrame(live);
+    if (steady) return;
+    hand.position.x += speed[0] + (tremble = -tremble);
+    hand.position.y += speed[1];
+    hand.position.z += speed[2];
+  };
+  live();
+}
+"""
+
+
+@pytest.fixture(scope="session")
+def iwer(pytestconfig: pytest.Config) -> str:
+    """The emulator's script, from npm; kept for the next run."""
+    folder = Path(pytestconfig.cache.mkdir("iwer"))
+    found = folder / f"{IWER.replace('@', '-')}.tgz"
+    for _ in range(3):
+        if found.exists() or not shutil.which("npm"):
+            break
+        subprocess.run(["npm", "pack", "--silent", IWER], cwd=folder, timeout=60, check=False, capture_output=True)
+    if not found.exists():
+        pytest.skip(f"needs {IWER} from npm")
+    with tarfile.open(found) as package:
+        script = package.extractfile("package/build/iwer.min.js").read()
+    assert hashlib.sha256(script).hexdigest() == DIGEST
+    return script.decode()
+
+
+@pytest.fixture
+def worn(bench: Bench, page: Browser, iwer: str) -> Iterator[Browser]:
+    """The page in control, in a headset that shows it."""
+    script = page.cdp("Page.addScriptToEvaluateOnNewDocument", source=iwer + WEAR)["identifier"]
+    page.open(bench.link)
+    page.wait_driving()
+    clear_trip(bench, page)
+    wear(page)
+    yield page
+    page.cdp("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+    bench.rig.world.reset("panda")
+
+
+def wear(page: Browser) -> None:
+    wait_for(lambda: page.text("#headset") == "Use headset", "the button")
+    page.click("#headset")
+    wait_for(lambda: page.text("#headset") == "Leave headset", "the session")
+
+
+def squeeze(bench: Bench, page: Browser, value: float = 1.0) -> None:
+    """Squeeze the controller, or release it, until the arm knows."""
+    if value:
+        wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad", BRIEF)
+    page.run(f"hand.updateButtonValue('squeeze', {value})")
+    wait_for(lambda: bench.deadman.held == bool(value), f"the squeeze {value}", BRIEF)
+
+
+def rest(bench: Bench, page: Browser) -> None:
+    """Release, for as long as a person does between two squeezes."""
+    page.run("speed = [0, 0, 0]; hand.updateButtonValue('squeeze', 0); hand.updateButtonValue('trigger', 0)")
+    wait_for(lambda: not bench.deadman.held and bench.rests(), "the arm to rest", BRIEF)
+    page.run("return new Promise((done) => setTimeout(done, 250))")
+
+
+def test_the_arm_follows_the_hand_while_it_is_squeezed_and_never_jumps(bench: Bench, worn: Browser) -> None:
+    def drive() -> None:
+        rest(bench, worn)
+        before = bench.tcp.copy()
+        squeeze(bench, worn)
+        worn.run("return new Promise((done) => setTimeout(done, 250))")
+        assert abs(bench.tcp - before).max() < 1e-4, "a squeeze moves nothing"
+        for step, way in (((0, 0, -0.01), (0.1, 0, 0)), ((-0.01, 0, 0), (0, 0.1, 0)), ((0, 0.01, 0), (0, 0, 0.1))):
+            start = bench.tcp.copy()
+            glide(worn, step)
+            wait_for(lambda to=start + way: abs(bench.tcp - to).max() < 2e-3, f"the way {way}", BRIEF)
+        rest(bench, worn)
+        before = bench.tcp.copy()
+        glide(worn, (0, 0, 0.01))
+        squeeze(bench, worn)
+        worn.run("return new Promise((done) => setTimeout(done, 250))")
+        assert abs(bench.tcp - before).max() < 1e-4, "neither does another squeeze, with the hand elsewhere"
+        turned = bench.arm.state(max_age=2.0).tcp
+        worn.run("hand.quaternion.set(0, Math.sin(0.15), 0, Math.cos(0.15))")
+        wait_for(lambda: abs(bench.arm.state(max_age=2.0).tcp.distance(turned)[1] - 0.3) < 0.02, "a turn", BRIEF)
+        worn.run("hand.updateButtonValue('trigger', 1)")
+        wait_for(lambda: bench.arm.gripper.state(max_age=2.0).width < 0.01, "the fingers to close", BRIEF)
+
+    bench.arm.gripper.open()
+    undisturbed(bench, worn, drive)
+    worn.run("hand.updateButtonValue('a-button', 1)")
+    wait_for(lambda: bench.trip == "stop", "STOP by the controller")
+
+
+def glide(page: Browser, step: tuple[float, float, float]) -> None:
+    """Move the hand by ten steps, m, one with each picture."""
+    page.run(
+        """const step = arguments[0]; speed = [0, 0, 0];
+        return new Promise((done) => {
+          let left = 10;
+          const next = () => {
+            if (left-- === 0) return done();
+            hand.position.x += step[0];
+            hand.position.y += step[1];
+            hand.position.z += step[2];
+            requestAnimationFrame(next);
+          };
+          next();
+        })""",
+        list(step),
+    )
+
+
+LOSSES = {
+    "lost tracking": ("blind = true", "blind = false"),
+    "a controller that is gone": ("hand.connected = false", "hand.connected = true"),
+    "a controller that keeps its last state": ("steady = true", "steady = false"),
+    "a leap of the tracking": ("hand.position.x -= 0.5", ""),
+    "the system's menu": (
+        "device.updateVisibilityState('visible-blurred')",
+        "device.updateVisibilityState('visible')",
+    ),
+    "a session that ends": ("document.querySelector('#headset').click()", ""),
+}
+
+
+def test_every_loss_of_the_hand_lets_go(bench: Bench, worn: Browser) -> None:
+    """And what comes back while it is still squeezed moves nothing."""
+
+    def lose(what: str, happens: str, ends: str) -> None:
+        rest(bench, worn)
+        if worn.text("#headset") == "Use headset":
+            wear(worn)
+            rest(bench, worn)
+        squeeze(bench, worn)
+        worn.run("speed = [-0.003, 0, 0]")
+        wait_for(lambda: bench.tcp_speed[1] > 0.05, f"motion before {what}", BRIEF)
+        worn.run(happens)
+        wait_for(lambda: not bench.deadman.held, f"{what} to let go", BRIEF)
+        wait_for(bench.rests, "the arm to rest", BRIEF)
+        worn.run(ends)
+        before = bench.tcp.copy()
+        worn.run("return new Promise((done) => setTimeout(done, 300))")
+        assert abs(bench.tcp - before).max() < 1e-3, f"{what} is over, and the arm moves by itself"
+
+    for what, (happens, ends) in LOSSES.items():
+        undisturbed(bench, worn, partial(lose, what, happens, ends))
