@@ -12,13 +12,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import hal
 from hal.keys import make_key
 
 from ._network import SERVER, run_apart
-from .kit import ROOT, Table, compare, cpu, ms
+from .kit import ROOT, Table, compare, ms
 
 PATHS = ("hal/remote/", "hal/keys.py")
 RATE = 1000.0
@@ -65,12 +66,18 @@ def measure_load(rig: hal.Rig, pids: tuple[int, int], seconds: float) -> list[fl
     """Return the shares of a core that two processes take while commands are sent at 1 kHz."""
     with rig.robots["panda"].control(rate_hz=10) as control:
         control.send(TURN)
-        before, began, sent = [cpu(pid) for pid in pids], time.monotonic(), 0
+        before, began, sent = [_cpu(pid) for pid in pids], time.monotonic(), 0
         while (now := time.monotonic()) < began + seconds:
             control.send(TURN)
             sent += 1
             time.sleep(max(0.0, began + sent / RATE - now))
-        return [(cpu(pid) - start) / (now - began) for pid, start in zip(pids, before, strict=True)]
+        return [(_cpu(pid) - start) / (now - began) for pid, start in zip(pids, before, strict=True)]
+
+
+def _cpu(pid: int) -> float:
+    """Return the processor's time of a process, s."""
+    runs = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(run.read_text().split()[0]) for run in runs) / 1e9
 
 
 SERVE_CAMERAS = f"""

@@ -134,6 +134,8 @@ class Served:
     def _request(self, method: str, params: dict[str, Any]) -> Any:
         if method in ("warnings", "reset_statistics", "statistics"):
             results = [host.request(method) for host in self.hosts]
+            if method == "reset_statistics":
+                self.link.offset.forget_round_trips()
             if method == "warnings":
                 return [text for result in results for text in result]
             return self._merge_statistics(results) if method == "statistics" else None
