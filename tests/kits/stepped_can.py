@@ -32,6 +32,7 @@ from hal.host import cycle as host_cycle
 from hal.host.hosts import LocalHost
 from hal.robot import Robot
 from hal.specs import GroupSpec, RobotSpec
+from hal_emulators import control
 from hal_emulators.can import console, server
 
 Array = NDArray[np.float64]
@@ -73,7 +74,7 @@ class SteppedEmulator:
     def __enter__(self) -> SteppedEmulator:
         clock = SimpleNamespace(monotonic=lambda: 1000.0 + self.passed, sleep=self.advance)
         self.clock = clock
-        for module in (damiao_chain, piper_link, server, console, host_cycle):
+        for module in (damiao_chain, piper_link, server, console, control, host_cycle):
             self._patches.enter_context(patch.object(module, "time", clock))
         self.bus.open()
         return self

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import ipaddress
 import json
+import math
 import signal
 import socket
 import sys
@@ -209,7 +210,10 @@ def read_switch(word: str) -> bool:
 
 def read_number(word: str, least: float, most: float) -> float:
     """Return a number in a range. Raises ValueError."""
-    value = float(word)
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
     if not least <= value <= most:
         raise ValueError(f"must be {least:g} to {most:g}, not {word}")
     return value
@@ -218,7 +222,7 @@ def read_number(word: str, least: float, most: float) -> float:
 def read_end(word: str) -> float:
     """Return the monotonic time at which a fault of so many s ends; "on" is never, "off" is now. Raises ValueError."""
     known = {"on": 1e9, "off": 0.0}
-    return time.monotonic() + (known[word] if word in known else float(word))
+    return time.monotonic() + (known[word] if word in known else read_number(word, 0.0, 1e9))
 
 
 def read_loopback(text: str) -> str:
