@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 from kit import Measured, eventually
 
-from hal.drivers.webcam import kernel
+from hal.drivers.webcam import kernel, preflight
 from hal.drivers.webcam.capture import V4l2Camera
-from hal.drivers.webcam.preflight import check_v4l2
 from hal.errors import ControlTaken, DeviceNotFound, NotSupported
 from hal.specs import CameraSpec
 from hal.testing import CameraBench, CameraContract, camera_spec
@@ -129,19 +128,20 @@ def check_stamps_and_numbers_fit(cameras: None, measured: Measured, lost: int) -
 
 
 def check_a_long_run_has_no_wrong_stamp(cameras: None, measured: Measured) -> None:
-    """At 30 frames a second, for as long as the script was told."""
+    """At 30 frames a second, for as long as the script was told; vivid itself is late on a busy computer."""
     seconds, rate = float(os.environ["HAL_KERNEL_SECONDS"]), 30.0
     driver = V4l2Camera(_spec(rate))
     driver.open()
     try:
-        first = last = driver.grab(5.0)
+        first = driver.grab(5.0)
         assert first is not None
+        last = first
         count, wrong, farthest, oldest = 1, 0, 0.0, 0.0
         while last.t < first.t + seconds:
             frame = driver.grab(5.0)
             assert frame is not None
             off = abs(frame.t - first.t - (frame.seq - first.seq) / rate)
-            wrong += not (off < 0.5 / rate and frame.seq > last.seq and frame.t > last.t)
+            wrong += not (off < 1.0 / rate and frame.seq > last.seq and frame.t > last.t)
             farthest, oldest = max(farthest, off), max(oldest, time.monotonic() - frame.t)
             count, last = count + 1, frame
     finally:
@@ -161,7 +161,7 @@ def check_controls_are_set_and_their_automatics_switched_off(cameras: None) -> N
 
 
 def check_the_preflight_measures_it(cameras: None, measured: Measured) -> None:
-    camera, frames = check_v4l2(_spec(), 3.0)
+    camera, frames = preflight.check_v4l2(_spec(), 3.0)
     assert camera.level == "ok"
     assert frames.level in ("ok", "warn")
     measured(frames.found)
