@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -126,12 +127,10 @@ def test_arm_and_gripper_are_one_robot_and_each_action_is_whole(tmp_path: Path) 
         arm.write(Setpoint([0.2, 0.3], [0.0] * 2, [0.0] * 2))
         gripper.move(0.04, 0.1, 10.0)
         end = time.monotonic() + 5.0
-        while gripper.read(time.monotonic()).moving or not robot.actions:
-            assert time.monotonic() < end
-            time.sleep(0.01)
-        assert robot.actions[-1] == pytest.approx(
-            {"one.pos": math.degrees(-0.1), "two.pos": math.degrees(0.3), "gripper.pos": 50.0}, abs=1.0
-        )
+        last = {"one.pos": math.degrees(-0.1), "two.pos": math.degrees(0.3), "gripper.pos": 50.0}
+        while gripper.read(time.monotonic()).moving or robot.actions[-1:] != [pytest.approx(last, abs=1.0)]:
+            assert time.monotonic() < end, robot.actions[-1:]
+            time.sleep(0.01)  # the fingers may be there but for 1 mm before the last action is sent
         assert arm.read(time.monotonic()).q == pytest.approx([0.2, 0.3])
         arm.close()
         assert robot.is_connected, "the gripper still uses it"
@@ -144,7 +143,7 @@ def test_arm_and_gripper_are_one_robot_and_each_action_is_whole(tmp_path: Path) 
 def test_the_check_says_how_fast_it_is_and_what_is_not_known(tmp_path: Path) -> None:
     speed, limits = check(specs(tmp_path), 0.1)
     assert (speed.level, limits.level) == ("ok", "unknown")
-    assert "two_joints answers in 2." in speed.found
+    assert re.search(r"two_joints answers in \d+\.\d", speed.found)
     assert "what it does when this program dies" in limits.found
 
 
