@@ -35,7 +35,7 @@ TURNS = 100
 """A loop over ``rig.clock.rate`` in a document ends after so many turns, unless it ends by itself."""
 SECONDS = "1.5"
 """A program that a document starts ends after so many, unless it ends by itself."""
-EPISODES = 10
+EPISODES = 5
 """A page that generates more gets so many."""
 
 HANG = 600

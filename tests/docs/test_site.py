@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("mkdocs", reason="needs pip install -e '.[docs]'")
 pytest.importorskip("mkdocstrings", reason="needs pip install -e '.[docs]'")
 
+pytestmark = pytest.mark.timeout(360)  # at idle priority it may take much longer than alone
 ROOT = Path(__file__).resolve().parents[2]
 PUBLIC = ("hal", "hal.commands", "hal.errors", "hal.driver", "hal.recording", "hal.calibration", "hal.testing")
 """Modules whose every public name is in the reference."""
@@ -30,7 +31,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
         text=True,
-        timeout=110,
+        timeout=300,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return folder

@@ -72,8 +72,8 @@ def test_images_of_another_sensor_give_the_pose_of_the_colour_sensor(options: li
 
 
 @pytest.mark.slow
-def test_with_pybullets_own_renderer(name: str) -> None:
-    options = ["simulation.renderer=tiny"]
+def test_with_pybullets_own_renderer() -> None:
+    name, options = "panda_calibration", ["simulation.renderer=tiny"]
     with hal.open(name, sim=True, clock="lock_step", pad="none", overrides=options) as rig:
         rig.clock.sleep(0.2)
         bench = CalibrationBench(rig, name)
