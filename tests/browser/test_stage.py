@@ -106,4 +106,5 @@ def test_the_gizmo_moves_the_arm_while_the_page_in_control_is_held_and_for_that_
             undisturbed(bench, staged, drive)
         finally:
             for view in views:
+                view.hear()  # its close waits for what is not read
                 view.close()
