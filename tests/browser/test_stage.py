@@ -76,7 +76,7 @@ def test_the_gizmo_moves_the_arm_while_the_page_in_control_is_held_and_for_that_
 ) -> None:
     """The mouse's part is said to the page's own 3D view; the thumb's is the page's key."""
     link = urlsplit(bench.link)
-    live = {"subprotocols": ["hal.v1", link.fragment], "origin": f"http://{link.netloc}"}
+    live = {"subprotocols": ["hal.v1", link.fragment], "origin": f"http://{link.netloc}", "close_timeout": 0.5}
     mine = urlsplit(staged.run(f"return {FRAME}.src")).path
     with connect(f"ws://{link.netloc}/live", **live) as other:
         number = json.loads(other.recv(timeout=5.0))["page"]

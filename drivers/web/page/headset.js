@@ -14,7 +14,7 @@ const SILENCE = 1000 * PAD_SILENCE; // ms
 /** Time for which all squeezes are released before one holds, ms: if the program missed a release, it missed more than
  * a dead-man may be silent for, so that the arm has tripped and does not follow a hand that is elsewhere by now. */
 const PAUSE = 1.25 * SILENCE;
-const ENTER = "Use headset";
+const ENTER = "Headset";
 const LEAP = 0.1; // m between two pictures, as no hand moves
 const DOWN = 0.9; // of a unit vector; steeper counts as looking down
 /** Modes of a session, the one that shows what is around first. @type {any[]} */
