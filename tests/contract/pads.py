@@ -78,7 +78,14 @@ def web_pad() -> Iterator[PadBench]:
 
         def speak(self) -> None:
             now, axes = bench.now, [0.0] * len(STICK_AXES)
-            message = {"connected": self.there, "t": now, "t_alive": now, "axes": axes, "buttons": self.mask}
+            message = {
+                "connected": self.there,
+                "t": now,
+                "t_alive": now,
+                "axes": axes,
+                "buttons": self.mask,
+                "pose": (),
+            }
             if not self.frozen:
                 self.queue.put(pad_reading(message, 0))
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
 
 from .franka_kit import Emulator, shared
+
+collect_ignore = [] if os.environ.get("HAL_SOAK") == "1" else ["test_tours.py"]
 
 
 @pytest.fixture(scope="module")
