@@ -1,7 +1,7 @@
 """The recorded tour in simulation and, in real time, through the emulators of a UR5e and an xArm7: ten times each.
 
-``HAL_SOAK=1 pytest tests/wire/test_tours.py`` on a computer that does nothing else, which takes minutes: a cycle of an arm
-that is missed is never caught up, so the arm comes less far. Without HAL_SOAK nothing of this file is collected.
+``HAL_SOAK=1 pytest tests/wire/test_tours.py`` on a computer that does nothing else, which takes minutes: a cycle of an
+arm that is missed is never caught up, so the arm comes less far. Without HAL_SOAK nothing of this file is collected.
 """
 
 from __future__ import annotations
