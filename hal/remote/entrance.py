@@ -74,7 +74,12 @@ class Entrance:
         sock.settimeout(HANDSHAKE_LIMIT)
         try:
             if sock.recv(1, socket.MSG_PEEK) not in (_TLS, b""):
-                raise self._refuse_plain(sock, peer, period)
+                text = (
+                    "connections to this server are encrypted: name it by an address in its certificate, not 127.0.0.1"
+                )
+                plain = ConnectionLost(text, code="no_tls")
+                _refuse(RigLink(sock, peer, period), sock, plain)
+                raise plain
             secured = self.credentials.wrap(sock)
         except OSError as error:
             sock.close()
@@ -86,20 +91,10 @@ class Entrance:
         try:
             link.at += f" ({self.credentials.check(certificate, peer)})"
         except HalError as error:
-            link.say_last({"error": pack_error(error)})
-            link.close()
+            _refuse(link, secured, error)
             raise
         link.check = partial(self.credentials.check, certificate, link.at)
         return link
-
-    def _refuse_plain(self, sock: socket.socket, peer: str, period: float) -> ConnectionLost:
-        text = "connections to this server are encrypted: name it by an address in its certificate, not 127.0.0.1"
-        error = ConnectionLost(text, code="no_tls")
-        link = RigLink(sock, peer, period)
-        link.post({"error": pack_error(error)})
-        link.send()
-        hang_up(sock)
-        return error
 
     def report(self, peer: str, error: HalError) -> None:
         """Report why a connection ended that has taken nothing: at most one in :data:`_REPORT_PERIOD`."""
@@ -110,3 +105,10 @@ class Entrance:
             self._report(f"{peer} is refused: {error}{more}")
         else:
             self._unreported += 1
+
+
+def _refuse(link: RigLink, sock: socket.socket, error: HalError) -> None:
+    """Say why, and hang up: a mere close takes the reason back if the other end is about to say what it wants."""
+    link.post({"error": pack_error(error)})
+    link.send()
+    hang_up(sock)

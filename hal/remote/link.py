@@ -209,8 +209,11 @@ class RigLink:
 
     def _read(self) -> None:
         try:
+            before = len(self._buffer)
             while len(self._buffer) < self.largest:
                 data = self._sock.recv(1 << 18)
+                if not data and len(self._buffer) > before:
+                    return  # what came last is taken first: it may say why
                 if not data:
                     raise ConnectionLost(f"{self.at} closed the connection", code="link_closed")
                 self._buffer += data

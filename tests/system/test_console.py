@@ -37,7 +37,7 @@ def console(rig: hal.Rig) -> Any:
 
 def page_of(rig: hal.Rig) -> Page:
     parts = urlsplit(console(rig).link)
-    return Page(SimpleNamespace(url=f"http://{parts.netloc}"), token=parts.fragment)
+    return Page(SimpleNamespace(url=f"http://{parts.netloc}", tls=True), token=parts.fragment)
 
 
 async def until(condition: Callable[[], Any], page: Page | None = None, **pad: Any) -> None:
