@@ -54,15 +54,16 @@ MARKERS = {
     "fast": "tests of the fast tier (unit, contract, lock_step and loops, without the slow ones): what 'pytest' runs",
     "slow": "takes more than a few seconds; never in the fast tier",
     "alone": "drives in real time what a busy computer would stop: CI runs nothing beside it",
-    "pair": "drives in real time, and may share two processors with one other: CI runs two at once, as of 'browser'",
-    "background": "needs no real time: CI runs it at idle priority beside 'pair' and 'browser'; all of BACKGROUND",
+    "pair": "drives in real time, and may share two processors with one other: CI runs two at once",
+    "background": "needs no real time: CI runs it at idle priority beside 'browser'; all of BACKGROUND",
 }
 BACKGROUND = ("unit", "lock_step", "docs", "packaging")
 """Folders whose tests, as far as they are not of the fast tier, are marked ``background``."""
 COLLECTED: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "not (fast": (tuple(name for name in OTHERS if name not in BACKGROUND), ("slow",)),
     "background": (("docs", "packaging"), ("slow", "background")),
-    "pair": (("browser",), ("pair",)),
+    "pair": ((), ("pair",)),
+    "browser": (("browser",), ()),
     "alone": ((), ("alone",)),
 }
 """How an expression after -m of ``.ci/run`` begins -> folders that it takes, and markers of its tests in other ones."""
