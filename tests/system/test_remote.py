@@ -85,6 +85,7 @@ def test_the_same_program_drives_an_arm_of_another_computer() -> None:
         server.kill()
 
 
+@pytest.mark.alone
 def test_an_episode_with_pictures_is_collected_over_the_link_and_replayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
