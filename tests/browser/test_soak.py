@@ -19,6 +19,7 @@ TRIES = 3
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(int(TRIES * SECONDS) + 180)
 def test_a_held_dead_man_stays_held() -> None:
     need_browser()
