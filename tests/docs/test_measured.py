@@ -16,10 +16,15 @@ ROOT = Path(__file__).resolve().parents[2]
 benchmarks = load_benchmark("__main__")
 PAGE = benchmarks.PAGE.read_text(encoding="utf-8")
 
+TIMED = {"console", "franka", "real_time", "remote", "stops"}
+"""Benchmarks that drive in real time."""
+
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-@pytest.mark.parametrize("name", benchmarks.NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.pair if name in TIMED else ()) for name in benchmarks.NAMES]
+)
 def test_a_benchmark_runs_for_a_second(name: str, tmp_path: Path) -> None:
     if name in ("lock_step", "render"):
         pytest.importorskip("pybullet", reason="pybullet is the reference")
