@@ -487,7 +487,7 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
     except HalError as error:
         return _report_failure(f"{type(error).__name__}: {error}")
     except BrokenPipeError:  # nothing reads the output any more, as behind "| head"
-        _discard_output()
+        discard_output()
         return 1
     except OSError as error:  # a device or a file that cannot be opened, or an output that cannot be written
         return _report_failure(f"{type(error).__name__}: {error}")
@@ -505,11 +505,11 @@ def _report_failure(message: str) -> int:
     try:
         sys.stdout.flush()
     except OSError:
-        _discard_output()
+        discard_output()
     return ACTION_NEEDED
 
 
-def _discard_output() -> None:
+def discard_output() -> None:
     """Redirect standard output to nowhere, so that the interpreter's flush at the end cannot fail either."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     with suppress(OSError, ValueError):

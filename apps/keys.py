@@ -1,6 +1,6 @@
 """Make, list and revoke the certificates with which computers may be served from and persons may connect.
 
-hal keys make --host arm-pc 192.168.1.5 --person anna
+hal keys make --host arm-pc 192.168.1.5 --person anna --viewer tv
 hal keys list
 hal keys revoke anna
 
@@ -40,6 +40,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--person", action="append", default=[], metavar="NAME", help="make: who connects; may be repeated"
     )
+    made.add_argument(
+        "--viewer", action="append", default=[], metavar="NAME", help="make: who may only watch; may be repeated"
+    )
     made.add_argument("--days", type=int, default=DAYS, help="make: how long they are valid (%(default)s)")
     return made
 
@@ -49,15 +52,16 @@ def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
     from hal.keys import keys_folder, make_key, read_list, revoke
 
-    makes, revokes = args.host or args.person, args.names
+    makes, revokes = args.host or args.person or args.viewer, args.names
     if bool(makes) != (args.action == "make") or bool(revokes) != (args.action == "revoke"):
-        raise CommandError("make takes --host and --person, revoke takes names, list takes nothing")
+        raise CommandError("make takes --host, --person and --viewer, revoke takes names, list takes nothing")
     for name, *addresses in args.host:
         file = make_key("host", name, addresses, args.days)
         folder = ".config/robot-hal/keys"
         print(f"{file}\n  to {name}: ssh {name} 'mkdir -p -m 700 {folder}' && scp {file} {name}:{folder}/")
-    for name in args.person:
-        print(make_key("person", name, (), args.days))
+    for role, names in (("person", args.person), ("viewer", args.viewer)):
+        for name in names:
+            print(make_key(role, name, (), args.days))
     for name in revokes:
         print(f"{name} is revoked where this list is; copy it into the same folder of each host: {revoke(name)}")
     if args.action == "list":

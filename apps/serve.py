@@ -1,10 +1,11 @@
-"""Serve the arms, grippers and cameras of a rig to programs on other computers: ``at: ADDRESS`` in their rigs.
+"""Serve the devices of a rig to programs on other computers: ``at: ADDRESS`` in their rigs.
 
 hal serve --config arm.yaml
 hal serve --config panda_table --sim --listen 127.0.0.1:7447
 
 The devices stay open until the server ends. An arm belongs to one program at a time, and comes to rest when that one
-leaves; nothing moves without a control session of the program. Any number of them may watch a camera.
+leaves; nothing moves without a control session of the program. Any number of them may watch a camera or read
+a gamepad.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, program
+from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, discard_output, program
 from hal.apps._display import banner
 from hal.apps.check import may_open
 
@@ -20,7 +21,7 @@ from hal.apps.check import may_open
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
-        prog="hal serve", description="Serve the arms and cameras of this computer to programs on others."
+        prog="hal serve", description="Serve the devices of this computer to programs on others."
     )
     add_config_options(made)
     made.add_argument(
@@ -46,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
     check_servable(plan)
     if not may_open(plan):
         return ACTION_NEEDED
-    with hal.open(**config_options(args), pad="none") as rig:
+    with hal.open(**config_options(args), pad="evdev") as rig:
         server = Server(rig, listen.address, listen.port if listen.fixed else PORT, _report)
         _report(banner(rig))
         keys = server.entrance.credentials
@@ -61,7 +62,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _report(line: str) -> None:
-    print(line, flush=True)
+    try:
+        print(line, flush=True)
+    except OSError:  # nothing reads the output any more; what is lent stays lent
+        discard_output()
 
 
 if __name__ == "__main__":

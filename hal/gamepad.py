@@ -81,6 +81,11 @@ class Gamepad:
         """Return the newest state; never waits. An unplugged pad has ``connected=False`` and everything released."""
         return self._state
 
+    @property
+    def reading(self) -> PadReading:
+        """Newest reading of the driver, of which nothing is left out yet."""
+        return self._reading
+
     def wake(self, event: threading.Event) -> None:
         """Set an event whenever an axis, a button or the connection changes, for ``rig.clock.rate(hz, wake=event)``."""
         self._wakers.append(event)

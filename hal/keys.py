@@ -28,8 +28,10 @@ from typing import Any, NamedTuple
 
 from .errors import CommandError, ConnectionLost, DriverMissing, NotSupported
 
-ROLES = {"host": "serverAuth", "person": "clientAuth"}
-"""Role -> what its certificate may be used for, which TLS checks."""
+VIEWER = "viewer"
+"""Role of those who may see states and pictures, and take nothing."""
+ROLES = {"host": "serverAuth", "person": "clientAuth", VIEWER: "clientAuth"}
+"""Role -> what its certificate may be used for, which TLS checks. A viewer's has the role in its subject, too."""
 DAYS = 365
 """Life of a certificate, days."""
 LIST = "certificates.txt"
@@ -95,7 +97,7 @@ def make_key(role: str, name: str, addresses: Sequence[str] = (), days: int = DA
         names = [name, f"{name}.local", *addresses]
         kinds = ",".join(f"{'IP' if _is_address(one) else 'DNS'}:{one}" for one in dict.fromkeys(names))
         more += ["-addext", f"subjectAltName={kinds}"]
-    made = _make(name, days, "CA:FALSE", "digitalSignature", *more)
+    made = _make(f"{name}/OU={VIEWER}" if role == VIEWER else name, days, "CA:FALSE", "digitalSignature", *more)
     until = time.strftime("%Y-%m-%d", time.gmtime(time.time() + 86400 * days))
     file = folder / f"{role}-{name}.pem"
     _write(file, made + authority.read_text())
@@ -191,6 +193,8 @@ def find_key(role: str) -> Path:
             or user (``many_certificates``), or others can read it (``keys_readable``).
     """
     folder = keys_folder()
+    if role == "person" and not any(folder.glob("person-*.pem")) and any(folder.glob(f"{VIEWER}-*.pem")):
+        role = VIEWER
     found, own = sorted(folder.glob(f"{role}-*.pem")), folder / f"{role}-{_own_name(role)}.pem"
     if not found:
         make = "--host NAME" if role == "host" else "--person NAME"
@@ -261,20 +265,21 @@ class Credentials:
             hang_up(secured)
             raise self.explain(error, at) from error
 
-    def check(self, certificate: Mapping[str, Any], at: str) -> str:
+    def check(self, certificate: Mapping[str, Any], viewers: bool = False) -> str:
         """Return the name in the other end's certificate, which a handshake accepted.
 
         Raises:
-            ConnectionLost: It was revoked (code ``certificate_revoked``) or has expired (``certificate_expired``).
+            ConnectionLost: It was revoked (code ``certificate_revoked``), has expired (``certificate_expired``), or is
+                that of a viewer (``certificate_wrong_role``), unless ``viewers`` are welcome.
         """
         name: str = next(value for part in certificate["subject"] for key, value in part if key == "commonName")
         if any(line.revoked and line.serial == certificate["serialNumber"] for line in read_list(self.file.parent)):
-            text = f"the certificate of {name} is revoked, {at} is refused: `hal keys make` makes a new one"
+            text = f"the certificate of {name} is revoked: `hal keys make` makes a new one"
             raise ConnectionLost(text, code="certificate_revoked")
+        if is_viewer(certificate) and not viewers:
+            raise ConnectionLost(f"{name} may only watch arms and cameras", code="certificate_wrong_role")
         if time.time() > ssl.cert_time_to_seconds(certificate["notAfter"]):
-            raise ConnectionLost(
-                f"{at} is refused: {_EXPIRED.format(f'the certificate of {name}')}", code=_THEIRS[10][0]
-            )
+            raise ConnectionLost(_EXPIRED.format(f"the certificate of {name}"), code=_THEIRS[10][0])
         return name
 
     def explain(self, error: BaseException, at: str) -> ConnectionLost:
@@ -296,6 +301,11 @@ class Credentials:
             return ConnectionLost(text, code="certificate_missing")
         text = f"no encrypted connection to {at} ({reason}): is it `hal serve`, with certificates?"
         return ConnectionLost(text, code="no_tls")
+
+
+def is_viewer(certificate: Mapping[str, Any]) -> bool:
+    """Whether a certificate, which a handshake accepted, is that of a viewer."""
+    return any(("organizationalUnitName", VIEWER) in part for part in certificate.get("subject", ()))
 
 
 def find_credentials(role: str) -> Credentials | None:

@@ -399,6 +399,8 @@ class PadSpec:
     """Whether a person must operate it, so that no recording is chosen for it."""
     leader: LeaderSpec | None = None
     """What a leader arm has beyond a gamepad; None for a gamepad."""
+    at: str | None = None
+    """Address of the computer that serves it; None if it is at this one."""
 
     @property
     def kind(self) -> str:

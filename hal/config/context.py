@@ -21,16 +21,17 @@ from ..kinematics.composition import FLANGE, MountedTool, compose_urdf
 from ..kinematics.hulls import FORMATS
 from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
-from ..specs import CameraSpec, RobotSpec
+from ..specs import CameraSpec, PadSpec, RobotSpec
 from .data_files import user_path
 from .files import Problems, find_file, leave_holes, read_yaml, suggest, validate
 from .models import CameraModel, FileSource, GripperFile, GripperModel, RobotModel, TcpModel
-from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
+from .rigfile import CameraConfig, Device, GripperConfig, LeaderConfig, PadConfig, RigFile, RobotConfig
 from .schema import Unknown
 
 Model = TypeVar("Model", RobotModel, CameraModel)
-Spec = TypeVar("Spec", RobotSpec, CameraSpec)
+Spec = TypeVar("Spec", RobotSpec, CameraSpec, PadSpec)
 Config = RobotConfig | GripperConfig | CameraConfig
+ServedConfig = RobotConfig | CameraConfig | PadConfig | LeaderConfig
 DrivenModel = RobotModel | GripperModel | CameraModel
 
 
@@ -62,7 +63,7 @@ class Context:
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
     gripper_files: dict[str, Path] = field(default_factory=dict)
     """Files of the grippers that are not part of their arm's model, by the keys of the arms in the rig."""
-    served: dict[str, dict[str, RobotSpec | CameraSpec]] = field(default_factory=dict)
+    served: dict[str, dict[str, RobotSpec | CameraSpec | PadSpec]] = field(default_factory=dict)
     """Devices at other computers, by their address and name; those that were asked."""
 
     @property
@@ -105,7 +106,7 @@ class Context:
                 return owner.sim
         return self.rig_sim
 
-    def is_served(self, config: RobotConfig | CameraConfig) -> bool:
+    def is_served(self, config: ServedConfig) -> bool:
         """Return whether a device is at another computer, and is not simulated here in its place."""
         return config.at is not None and self.sim is not True and self.driver is None and config.sim is not True
 
@@ -121,9 +122,11 @@ class Context:
         if at not in self.served:
             self.served[at] = fetch_devices(at)
         section, name = key.split(".", 1)
+        what = section.removesuffix("s")
         there = {name: device for name, device in self.served[at].items() if isinstance(device, kind)}
+        there = {name: device for name, device in there.items() if getattr(device, "kind", what) == what}
         if name not in there:
-            what, has = section.removesuffix("s"), ", ".join(there) or "none"
+            has = ", ".join(there) or "none"
             self.report(key, f"the rig at {at} has no {what} {name!r}; it has: {has}", f"unknown_{what}")
         return there.get(name)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,7 +21,7 @@ from ..kinematics.collisions import in_one_place
 from ..kinematics.urdf import read_urdf
 from ..pads.model import pad_model
 from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RandomizeSpec, RobotSpec, WorldSpec
-from .context import Context
+from .context import Context, ServedConfig
 from .data_files import user_path
 from .files import find_file, read_yaml, suggest
 from .models import load_pad_models
@@ -29,12 +30,13 @@ from .resolve_cameras import resolve_camera
 from .resolve_leaders import resolve_leader
 from .resolve_randomize import resolve_randomize
 from .resolve_robots import resolve_robot
-from .rigfile import CameraConfig, Device, PadConfig, RobotConfig
+from .rigfile import Device, PadConfig
 from .schema import Unknown
 
 CHOSEN_LATER = "auto"
 """Stands for a pad that is chosen when the rig opens, in place of the name of a driver."""
 
+_SECTIONS = ("robots", "cameras", "leaders", "gamepads")
 Config = TypeVar("Config")
 Spec = TypeVar("Spec")
 
@@ -156,6 +158,10 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         if config.drives is not None and config.drives not in context.rig.robots:
             message = f"there is no robot {config.drives!r}{suggest(config.drives, context.rig.robots)}"
             context.report(f"{key}.drives", message, "unknown_robot")
+    with suppress(Unknown):
+        if context.is_served(config):
+            served = context.find_served(PadSpec, key, str(config.at))
+            return None if served is None else replace(served, drives=config.drives)
     models = tuple(load_pad_models(context.problems).values())
     if context.problems.found or driver is None:
         return None
@@ -239,7 +245,7 @@ def _resolve_all(
 
 def _check_names(context: Context) -> None:
     taken: dict[str, str] = {}
-    for section in ("robots", "cameras", "leaders", "gamepads"):
+    for section in _SECTIONS:
         for name in getattr(context.rig, section, ()):
             key = f"{section}.{name}"
             if name in taken:
@@ -251,17 +257,17 @@ def _check_names(context: Context) -> None:
 def _check_clock(context: Context) -> None:
     if context.time != "lock_step":
         return
-    for section in ("robots", "cameras"):
-        devices: dict[str, Device] = getattr(context.rig, section, {})
+    for section in _SECTIONS:
+        devices: dict[str, ServedConfig] = getattr(context.rig, section, {})
         for name, config in devices.items():
             with suppress(Unknown):
                 key = f"{section}.{name}"
-                if isinstance(config, (RobotConfig, CameraConfig)) and context.is_served(config):
+                if context.is_served(config):
                     context.report(
                         key, "is at another computer: use the clock real_time, or --sim", "real_in_lock_step"
                     )
                     continue
-                if context.is_simulated(config):
+                if not isinstance(config, Device) or context.is_simulated(config):
                     continue
                 if key in context.real_time_only:
                     text = "is emulated on a bus, where time cannot be stepped: use the clock real_time, or simulate it"

@@ -21,6 +21,9 @@ def resolve_leader(context: Context, name: str, config: LeaderConfig) -> PadSpec
     with suppress(Unknown):
         _check_names(context, key, config)
     with suppress(Unknown):
+        if context.is_served(config):
+            return _find_served(context, key, config)
+    with suppress(Unknown):
         model = _read_model(context, key, config)
         if model is None:
             return None
@@ -38,6 +41,18 @@ def resolve_leader(context: Context, name: str, config: LeaderConfig) -> PadSpec
             context.report(f"{key}.{relative}", message, code)
         return spec
     return None
+
+
+def _find_served(context: Context, key: str, config: LeaderConfig) -> PadSpec | None:
+    """Return the record of a leader at another computer; its dead-man is a gamepad of this rig, served or not."""
+    spec = context.find_served(PadSpec, key, str(config.at))
+    if spec is None or spec.leader is None:
+        return None
+    deadman = config.deadman or spec.leader.deadman
+    if deadman is not None and deadman not in context.rig.gamepads:
+        message = f"its dead-man is the gamepad {deadman!r} there: add gamepads.{deadman}.at, or name another one here"
+        context.report(f"{key}.deadman", message, "unknown_device")
+    return replace(spec, drives=config.drives, leader=replace(spec.leader, deadman=deadman))
 
 
 def _check_names(context: Context, key: str, config: LeaderConfig) -> None:

@@ -203,12 +203,12 @@ class Device(Strict):
     """Options of the simulated driver."""
 
 
-class ServedDevice(Device):
-    """Keys of every robot and camera."""
+class ServedDevice(Strict):
+    """A device that another computer may serve."""
 
     at: Address | None = None
     """The computer that serves this device (``hal serve``), ``NAME`` or ``NAME:PORT``. Its rig has a device of this
-    name, with all settings; the other keys of this entry are for ``--sim``."""
+    name, with all settings; the other keys of this entry, but ``drives``, are for ``--sim``."""
 
 
 class LimitsConfig(LimitsModel):
@@ -255,7 +255,7 @@ def _expand_gripper(value: Any) -> Any:
     return {"model": value} if isinstance(value, str) else value
 
 
-class RobotConfig(ServedDevice):
+class RobotConfig(Device, ServedDevice):
     """An arm."""
 
     model: str = ""
@@ -335,7 +335,7 @@ class IntrinsicsConfig(Strict):
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
 
 
-class CameraConfig(ServedDevice):
+class CameraConfig(Device, ServedDevice):
     """A camera. One of ``look_at``, ``pose`` and ``attached`` gives its pose."""
 
     model: str = ""
@@ -370,7 +370,7 @@ class CameraConfig(ServedDevice):
         return self
 
 
-class PadConfig(Strict):
+class PadConfig(ServedDevice):
     """A gamepad."""
 
     sim: Flag | None = None
@@ -390,10 +390,10 @@ class PadConfig(Strict):
     """Options of the driver."""
 
 
-class LeaderConfig(LeaderJoints):
+class LeaderConfig(LeaderJoints, ServedDevice):
     """A leader arm, which a person moves and an arm of the rig follows."""
 
-    model: str
+    model: str = ""
     """A name in ``sensors/leaders/``, or the path of a file of your own."""
     sim: Flag = False
     """``true``: simulated, moved by the program. The rig's flag is for robots and cameras, as with gamepads."""

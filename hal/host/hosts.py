@@ -348,7 +348,11 @@ class RemoteHost(Host):
             raise self._make_fork_error()
         if self._closed.is_set():
             raise HalError("the rig is closed", code="closed")
-        self.child.check()
+        try:
+            self.child.check()
+        except ConnectionLost:
+            self.child.raise_last_error()  # a link says why it ended
+            raise
         silence = self._silence()
         if silence > SILENT:
             raise ConnectionLost(

@@ -321,7 +321,7 @@ class Child:
         except BaseException as error:
             self._waiting.discard(number)
             if isinstance(error, ConnectionLost):
-                self._raise_last_error()
+                self.raise_last_error()
             raise
         return number
 
@@ -398,7 +398,7 @@ class Child:
                     f"the {self.name} process did not {task} within {timeout:g} s{self._tail()}", code="process_silent"
                 )
 
-    def _raise_last_error(self) -> None:
+    def raise_last_error(self) -> None:
         """Raise the error that ended the process, if it sent one that was not read yet."""
         with contextlib.suppress(ConnectionLost):
             while self._listen(0.0):

@@ -375,7 +375,7 @@ class PolicyServer:
         await socket.prepare(request)
         if self._credentials is not None:
             try:
-                self._credentials.check(request.transport.get_extra_info("peercert"), str(request.remote))
+                self._credentials.check(request.transport.get_extra_info("peercert"))
             except HalError as error:
                 await socket.send_str(f"{_ERROR}{error}")
                 return socket

@@ -14,7 +14,7 @@ program and host each see memory of their own computer, and nothing above or bel
 * :mod:`.client`: the process in place of a host. It starts, answers, fails and ends as a host's process does.
 * :mod:`.server`: lends the hosts of its open rig to a client, and takes them back, at rest, when that client leaves.
   The next one has other sessions and a dead-man that was not pressed yet: nothing resumes.
-* :mod:`.frames`: pictures of a camera, over a connection of their own.
+* :mod:`.frames` and :mod:`.pads`: pictures of a camera, readings of a gamepad, each over a connection of its own.
 * :mod:`.entrance`: who is let in, with which certificate (:mod:`hal.keys`). :mod:`.measure`: what a link is good for.
 
 **The dead-man is end to end.** The server never makes a sign of life. That of the program (its heartbeat, the stamp of

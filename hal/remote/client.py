@@ -18,7 +18,7 @@ from ..host.process import Channel, ChannelClosed, SharedMemory, pack_error, unp
 from ..host.records import GroupMemory
 from ..keys import Credentials, needs_keys
 from ..kinematics.composition import keep_urdf
-from ..specs import CameraSpec, GroupSpec, RobotSpec, from_json
+from ..specs import CameraSpec, GroupSpec, PadSpec, RobotSpec, from_json
 from .boxes import boxes_of_hosts, boxes_of_program
 from .link import ANSWER_LIMIT, CLOSE_LIMIT, PORT, RigLink, describe_version
 
@@ -37,7 +37,7 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
 
     Args:
         at: Its address.
-        purpose: What the connection is for: ``{"want": "devices"}``, ``"control"`` or ``"frames"``.
+        purpose: What the connection is for: ``{"want": "devices"}``, ``"control"``, ``"frames"`` or ``"pad"``.
 
     Raises:
         ConnectionLost: Nothing answers there (``code`` is ``no_server``); or a certificate is refused, see
@@ -58,7 +58,7 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
     link = RigLink(sock, at)
     try:
         if credentials is not None:
-            link.check = partial(credentials.check, secured.getpeercert() or {}, at)
+            link.check = partial(credentials.check, secured.getpeercert() or {})
         link.post(describe_version() | purpose)
         answer = link.await_message()
         if "error" in answer:
@@ -74,8 +74,8 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
     return link, answer
 
 
-def fetch_devices(at: str) -> dict[str, RobotSpec | CameraSpec]:
-    """Return the arms and cameras that another computer serves, by name. Raises as :func:`connect`.
+def fetch_devices(at: str) -> dict[str, RobotSpec | CameraSpec | PadSpec]:
+    """Return the arms, cameras and gamepads that another computer serves, by name. Raises as :func:`connect`.
 
     Their URDFs are those of this computer where they are the same, else copies in the user's cache; the meshes of
     these are missing.
@@ -83,7 +83,7 @@ def fetch_devices(at: str) -> dict[str, RobotSpec | CameraSpec]:
     link, answer = connect(at, {"want": "devices"})
     link.close()
     files = {path: _place_urdf(path, text) for path, text in answer["urdfs"].items()}
-    found: dict[str, RobotSpec | CameraSpec] = {}
+    found: dict[str, RobotSpec | CameraSpec | PadSpec] = {}
     for data in answer["robots"]:
         spec = from_json(RobotSpec, data)
         kinematics = replace(spec.kinematics, urdf=files[spec.kinematics.urdf])
@@ -91,6 +91,12 @@ def fetch_devices(at: str) -> dict[str, RobotSpec | CameraSpec]:
     for data in answer["cameras"]:
         camera = from_json(CameraSpec, data)
         found[camera.name] = replace(camera, at=at, driver=registry.SERVED)
+    for data in answer["pads"]:
+        pad = from_json(PadSpec, data)
+        if pad.leader is not None and pad.leader.kinematics is not None:
+            own = replace(pad.leader.kinematics, urdf=files[pad.leader.kinematics.urdf])
+            pad = replace(pad, leader=replace(pad.leader, kinematics=own))
+        found[pad.name] = replace(pad, at=at, driver=registry.SERVED)
     return found
 
 

@@ -12,7 +12,7 @@ from functools import partial
 
 from ..errors import ConnectionLost, HalError
 from ..host.process import pack_error
-from ..keys import HANDSHAKE_LIMIT, Credentials, hang_up, needs_keys
+from ..keys import HANDSHAKE_LIMIT, Credentials, hang_up, is_viewer, needs_keys
 from .link import RigLink
 
 MOST = 16
@@ -89,11 +89,12 @@ class Entrance:
         link = RigLink(secured, peer, period)
         certificate = secured.getpeercert() or {}
         try:
-            link.at += f" ({self.credentials.check(certificate, peer)})"
+            link.at += f" ({self.credentials.check(certificate, viewers=True)})"
+            link.viewer = is_viewer(certificate)
         except HalError as error:
             _refuse(link, secured, error)
             raise
-        link.check = partial(self.credentials.check, certificate, link.at)
+        link.check = partial(self.credentials.check, certificate, viewers=True)
         return link
 
     def report(self, peer: str, error: HalError) -> None:

@@ -132,6 +132,8 @@ class RigLink:
         """Number of the newest frame that was sent."""
         self.largest = _LARGEST
         """Size of the largest frame that is taken, bytes."""
+        self.viewer = False
+        """Whether the other end may only watch, by its certificate."""
         self.took = 0.0
         """How long the connection took the newest frame with something new, s."""
         self.check: Callable[[], object] = lambda: None

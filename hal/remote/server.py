@@ -20,18 +20,21 @@ from ..host.hosts import RemoteHost
 from ..host.process import STOP_LIMIT, pack_error
 from ..host.records import GripperMail, RobotMail
 from ..servo.watchdog import SILENCE
-from ..specs import CameraSpec, Plan, RobotSpec, to_json
+from ..specs import CameraSpec, PadSpec, Plan, RobotSpec, to_json
 from .boxes import boxes_of_hosts, boxes_of_program
 from .entrance import Entrance
 from .frames import send_frames
 from .link import CLOSE_LIMIT, MOST_ROUND_TRIP, RigLink, describe_version
 from .measure import echo
+from .pads import send_readings
 
 if TYPE_CHECKING:
     from ..rig import Rig
 
 PERIOD = 0.002
 """Longest time from a new state to its frame, s."""
+MOST_READERS = 64
+"""Connections that may read cameras and gamepads, and as many viewers of arms."""
 _LEAVING = 1.0
 """Longest wait for a client that is about to leave, s."""
 
@@ -48,6 +51,7 @@ class Served:
 
     def __init__(self, hosts: Sequence[RemoteHost], link: RigLink, wish: dict[str, Any], over: threading.Event) -> None:
         self._over = over
+        self._watches = link.viewer
         self.link = link
         self.hosts = hosts
         self._robots = {robot.name: robot for host in hosts for robot in host.spec.robots}
@@ -55,7 +59,8 @@ class Served:
         grippers = {name: self._find_gripper(name) for name in wish["grippers"]}
         memories = [host.memory for host in hosts]
         ahead = {name: self._robots[name].deadline_max for name in robots}
-        link.incoming = boxes_of_program(memories, robots, grippers, ahead)
+        if not self._watches:  # nothing that a viewer writes reaches a host
+            link.incoming = boxes_of_program(memories, robots, grippers, ahead)
         link.outgoing = boxes_of_hosts(memories, robots, grippers)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="hal-serve-request")  # one request at a time
 
@@ -63,7 +68,7 @@ class Served:
         """Copy until the client leaves or is gone; bring the arms to rest."""
         link = self.link
         try:
-            for host in self.hosts:
+            for host in () if self._watches else self.hosts:
                 host.lend(True)
             link.post({"ready": {"realtime": all(host.child.ready["realtime"] for host in self.hosts)}})
             self._copy()
@@ -95,6 +100,8 @@ class Served:
 
         Its arms come to rest before there is another sign of life, and its grippers stop for the lack of one.
         """
+        if self._watches:
+            return
         self.link.incoming = self.link.outgoing = ()  # the end of its sessions is not news for it, the reason is
         arms = [mail for host in self.hosts for mail in host.memory.robots.values()]
         for mail in arms:
@@ -132,6 +139,10 @@ class Served:
         self.link.post({"id": message["id"], **answer})
 
     def _request(self, method: str, params: dict[str, Any]) -> Any:
+        if self._watches and method == "reset_statistics":
+            return self.link.offset.forget_round_trips()
+        if self._watches and method not in ("warnings", "statistics"):
+            raise NotSupported("a viewer may only watch: `hal keys make --person` for who drives", code="read_only")
         if method in ("warnings", "reset_statistics", "statistics"):
             results = [host.request(method) for host in self.hosts]
             if method == "reset_statistics":
@@ -193,6 +204,7 @@ class Server:
         self._report = report
         self._leases = threading.Condition()
         self._over = threading.Event()
+        self._readers = threading.Semaphore(MOST_READERS)
         self.served: list[Served] = []
         """What is lent at present."""
         try:
@@ -268,27 +280,36 @@ class Server:
             if want == "echo":
                 echo(link, self._over)
                 return
-            if want != "frames":
+            if want == "control":
                 served = self._lend(link, wish)
+            elif link.viewer and want == "pad":
+                raise NotSupported("a viewer may not use a gamepad", code="read_only")
+            elif not self._readers.acquire(blocking=False):
+                raise ControlTaken(f"there are {MOST_READERS} readers of cameras and gamepads", code="too_many_readers")
         except HalError as error:
             link.say_last({"error": pack_error(error)})
             raise
         self.entrance.leave(peer)
         try:
-            if want == "frames":
-                send_frames(self._rig.cameras[wish["camera"]], link, self._over)
-            else:
+            if want == "control":
                 self._run(served, ", ".join(name for name, _ in wish["robots"]))
+            elif want == "pad":
+                send_readings(self._rig.gamepads[wish["pad"]], link, self._over)
+            else:
+                send_frames(self._rig.cameras[wish["camera"]], link, self._over)
         except ConnectionLost as error:
             self._report(f"{link.at}: {error}")
-            if want == "frames":
+            if want != "control":
                 link.say_last({"error": pack_error(error)})
+        finally:
+            if want != "control":
+                self._readers.release()
 
     def _run(self, served: Served, names: str) -> None:
         at = served.link.at
         try:
             served.link.post({"accepted": True})
-            self._report(f"{at} has taken {names}")
+            self._report(f"{at} {'watches' if served.link.viewer else 'has taken'} {names}")
             served.run()
         finally:
             with self._leases:
@@ -302,10 +323,13 @@ class Server:
         hosts = [host for host in self._hosts if names & {*host.memory.robots, *host.memory.grippers}]
 
         def owners() -> list[str]:
-            return [served.link.at for served in self.served if not set(hosts).isdisjoint(served.hosts)]
+            lent = [served for served in self.served if not served.link.viewer]
+            return [served.link.at for served in lent if not set(hosts).isdisjoint(served.hosts)]
 
         with self._leases:
-            if not self._leases.wait_for(lambda: not owners(), _LEAVING):
+            if link.viewer and len(self.served) >= MOST_READERS:
+                raise ControlTaken(f"{len(self.served)} programs watch", code="too_many_readers")
+            if not link.viewer and not self._leases.wait_for(lambda: not owners(), _LEAVING):
                 raise ControlTaken(f"this rig is in use by {owners()[0]}", code="in_use")
             self.served.append(Served(hosts, link, wish, self._over))
             return self.served[-1]
@@ -315,14 +339,14 @@ def check_servable(plan: Plan) -> None:
     """Raise NotSupported or CommandError for a rig that cannot be served, as :class:`Server`."""
     if plan.clock == "lock_step":
         raise NotSupported("a served rig needs real time; leave out the clock lock_step", code="needs_real_time")
-    devices: tuple[RobotSpec | CameraSpec, ...] = (*plan.robots, *plan.cameras)
+    devices: tuple[RobotSpec | CameraSpec | PadSpec, ...] = (*plan.robots, *plan.cameras, *plan.pads)
     for device in devices:
         if device.at is not None:
             raise NotSupported(
                 f"{device.name} is served by another computer: name that one in the rig", code="served_twice"
             )
     if not devices:
-        raise CommandError(f"{plan.source} has no arm or camera to serve", code="no_devices")
+        raise CommandError(f"{plan.source} has no arm, camera or gamepad to serve", code="no_devices")
 
 
 def check_version(wish: dict[str, Any]) -> None:
@@ -336,14 +360,20 @@ def check_version(wish: dict[str, Any]) -> None:
 
 
 def describe_devices(plan: Plan) -> dict[str, Any]:
-    """Return the records of arms and cameras and the text of the arms' URDFs, without the options of the drivers."""
+    """Return the records of all devices and the text of their URDFs, without the options of the drivers."""
     public = [
         replace(robot, options={}, gripper=None if robot.gripper is None else replace(robot.gripper, options={}))
         for robot in plan.robots
     ]
+    pads = [replace(pad, options={}, model=None, models=()) for pad in plan.pads]
+    pads = [pad if pad.leader is None else replace(pad, leader=replace(pad.leader, follow=0.0)) for pad in pads]
     files = {path for robot in public for path in (robot.urdf, robot.kinematics.urdf)}
+    files |= {
+        pad.leader.kinematics.urdf for pad in pads if pad.leader is not None and pad.leader.kinematics is not None
+    }
     return {
         "robots": [to_json(robot) for robot in public],
         "cameras": [to_json(replace(camera, options={})) for camera in plan.cameras],
+        "pads": [to_json(pad) for pad in pads],
         "urdfs": {path: Path(path).read_text(encoding="utf-8") for path in sorted(files)},
     }

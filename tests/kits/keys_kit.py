@@ -17,10 +17,11 @@ def make_keys(root: Path, address: str) -> None:
         for folder in ("home", "foreign"):
             patch.setenv("HAL_KEYS", str(root / folder))
             hosts = ["--host", "arm-pc", address, "--host", "other", "10.0.0.7"]
-            assert main(["make", *hosts, "--person", "anna"]) == 0
+            assert main(["make", *hosts, "--person", "anna", "--viewer", "tv"]) == 0
     home = root / "home"
     for folder, file, name in (
         ("person", home / "person-anna.pem", ""),
+        ("viewer", home / "viewer-tv.pem", ""),
         ("host", home / "host-arm-pc.pem", ""),
         ("revoking host", home / "host-arm-pc.pem", ""),
         ("other host", home / "host-other.pem", ""),

@@ -54,7 +54,7 @@ with hal.open({"robots": {"panda": {"at": sys.argv[1]}}}, pad="none") as rig:
             except hal.MotionStopped as stop:
                 say(stopped=stop.code)
             except hal.ConnectionLost as lost:
-                say(lost=str(lost))
+                say(lost=lost.code)
                 break
 """
 """Drives the arm until it is told to end, holding its dead-man; says each stop."""
@@ -207,9 +207,8 @@ def _has_message(frame: bytes) -> bool:
 class Bench:
     """A served mock arm, and a proxy before it."""
 
-    def __init__(self, rig: hal.Rig, server: Server) -> None:
-        self.rig, self.server = rig, server
-        self.proxy = Proxy(server.port)
+    def __init__(self, rig: hal.Rig, server: Server, proxy: Proxy) -> None:
+        self.rig, self.server, self.proxy = rig, server, proxy
         self.programs: list[DrivingProgram] = []
 
     def drive(self, deadman: bool = True) -> DrivingProgram:
@@ -235,20 +234,32 @@ class Bench:
 
 
 @contextmanager
+def serve_rig(rig: hal.Rig) -> Iterator[tuple[Server, Proxy]]:
+    """Serve a rig of this process, and yield the server with a proxy before it."""
+    server = Server(rig, "127.0.0.1", 0, lambda line: None)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    proxy = Proxy(server.port)
+    try:
+        yield server, proxy
+    finally:
+        server.close()
+        thread.join()
+        proxy.close()
+
+
+@contextmanager
 def served_arm() -> Iterator[Bench]:
     """Serve a mock arm; close everything in the end."""
     overrides = {"cameras": {}, "gamepads": {}, "objects": []}
-    with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=overrides) as rig:
-        server = Server(rig, "127.0.0.1", 0, lambda line: None)
-        thread = threading.Thread(target=server.run)
-        thread.start()
-        bench = Bench(rig, server)
+    with (
+        hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=overrides) as rig,
+        serve_rig(rig) as (server, proxy),
+    ):
+        bench = Bench(rig, server, proxy)
         try:
             yield bench
         finally:
             for program in bench.programs:
                 program.process.kill()
                 program.process.wait()
-            server.close()
-            thread.join()
-            bench.proxy.close()

@@ -122,7 +122,14 @@ def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_
             assert len(measured["link"]["round_trips"]) >= 20
             assert abs(measured["link"]["offset"]) <= measured["link"]["shortest"] / 2.0, "one computer has one clock"
             assert measured["verdicts"][0]["found"].startswith("TLSv1.3")
-            with pytest.raises(ConnectionLost, match="anna is revoked"), arm.control(rate_hz=5) as control:
+            become("viewer")
+            with hal.open(rig, pad="none") as watched:
+                assert (watched.robots["panda"].state().q_set == rest).all()
+                with raises_code(NotSupported, "read_only"), watched.robots["panda"].control():
+                    pass
+                watched.stop()  # of that program, and of no other
+            become("person")
+            with raises_code(ConnectionLost, "certificate_revoked"), arm.control(rate_hz=5) as control:
                 control.send(hal.JointVelocity([0.0] * 7))
                 (tmp_path / "host" / "certificates.txt").write_text(revoke(tmp_path, "anna"))
                 while True:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from link_kit import Bench, served_arm, start_server
+from link_kit import Bench, serve_rig, served_arm, start_server
 from operator_kit import Operator
 from recording_kit import small
 from waiting import wait_until
@@ -25,6 +27,7 @@ from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
 from hal.lock import APP_MARK
 from hal.recording import Dataset
+from hal.remote.client import connect
 from hal.servo.watchdog import SILENCE
 from hal.types import RobotStatus, Trip
 
@@ -113,6 +116,64 @@ def test_an_episode_with_pictures_is_collected_over_the_link_and_replayed(
         server.wait()
 
 
+@contextlib.contextmanager
+def stream(rig: hal.Rig) -> Iterator[None]:
+    """Let the arm turn for as long as the pad's trigger is held, at the speed 0.2 rad/s."""
+    arm, over = rig.robots["panda"], threading.Event()
+
+    def send(control: hal.Control) -> None:
+        while not over.wait(0.01):
+            with contextlib.suppress(hal.MotionStopped):
+                control.send(hal.JointVelocity([0.2, 0, 0, 0, 0, 0, 0]))
+
+    with arm.control(rate_hz=5, deadman=rig.gamepads["pad"].hold("l2")) as control:
+        thread = threading.Thread(target=send, args=(control,))
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+def test_a_pad_of_a_third_computer_holds_the_dead_man_and_a_new_press_is_needed_when_it_was_lost(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Arm at one computer, pad and leader at another one, program at a third one."""
+    monkeypatch.setattr("hal.remote.server.MOST_READERS", 2)
+    devices = {"gamepads": {"pad": {"driver": "mock"}}, "leaders": {"left": {"model": "so101_leader", "sim": True}}}
+    with hal.open(devices, clock="real_time") as there, serve_rig(there) as (_, proxy):
+        pad: Any = there.driver("pad")
+        leader: Any = there.driver("left")
+        at = {"robots": {"panda": {"at": bench.proxy.at}}, "gamepads": {"pad": {"at": proxy.at}}}
+        with hal.open({**at, "leaders": {"left": {"at": proxy.at}}}) as rig, stream(rig):
+            found = rig.gamepads["pad"]
+            with raises_code(ControlTaken, "too_many_readers"):
+                connect(proxy.at, {"want": "pad", "pad": "pad"})
+            for harm in (proxy.stalled.set, proxy.cut):
+                pad.release("l2")
+                wait_until(lambda: found.state().connected and not found.waiting_for, "the pad counts")
+                pad.press("l2")
+                wait_until(lambda: bench.speed() > 0.15, "the arm moves")
+                began = time.monotonic()
+                harm()
+                wait_until(lambda: bench.speed() == 0.0 and not found.state().connected, "stopped")
+                assert bench.servo().trip in (Trip.DEADMAN_SILENT, Trip.DEADMAN_LOST)
+                assert bench.servo().t_stop - began <= SILENCE + LATE
+                proxy.stalled.clear()
+                wait_until(lambda: found.state().connected, "back")
+                rest = bench.servo().q_set
+                time.sleep(0.3)
+                assert bench.servo().q_set == rest, "what is still held moves nothing"
+            assert pad.rumbles, "the stop was felt"
+            leader.move([0.1] * 5)
+            wait_until(lambda: rig.gamepads["left"].state().joints == (0.1,) * 5, "the leader's joints arrive")
+            proxy.delay = 0.06
+            proxy.cut()
+            wait_until(lambda: any("round trip" in note for note in found.notes), "a link that is too slow")
+            assert not found.state().connected
+
+
 def find_hosts(server: int) -> list[str]:
     """Return the processes that own the devices of a server."""
     found = []
@@ -122,17 +183,19 @@ def find_hosts(server: int) -> list[str]:
     return found
 
 
-def test_a_server_that_is_killed_leaves_nothing_and_the_next_call_says_so() -> None:
+@pytest.mark.parametrize(("victim", "code"), [("server", "link_closed"), ("host", "process_ended")])
+def test_a_server_or_its_host_that_is_killed_leaves_nothing_and_the_next_call_says_so(victim: str, code: str) -> None:
     server, at = start_server()
     try:
         with hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
-            assert find_hosts(server.pid)
-            server.kill()
-            with pytest.raises(ConnectionLost, match="connection"):
+            (host,) = find_hosts(server.pid)
+            os.kill(server.pid if victim == "server" else int(host), signal.SIGKILL)
+            with raises_code(ConnectionLost, code):
                 while True:
                     rig.robots["panda"].check()
                     time.sleep(0.01)
             wait_until(lambda: not find_hosts(server.pid), "nothing is left")
+            server.wait(20.0)
     finally:
         server.kill()
 
@@ -177,14 +240,20 @@ def test_a_program_that_freezes_or_is_killed(bench: Bench, what: str, how: signa
         assert program.wait_for("stopped")
 
 
-def test_a_link_that_is_cut_ends_the_program_and_a_new_one_moves_nothing_by_itself(bench: Bench) -> None:
+@pytest.mark.parametrize("how", ["closed", "cable"])
+def test_a_link_that_is_lost_ends_the_program_and_a_new_one_moves_nothing_by_itself(bench: Bench, how: str) -> None:
+    """The connection is closed, or the cable is pulled, of which neither end hears."""
     program = bench.drive()
     mail, began = bench.mail, time.monotonic()
-    bench.proxy.cut()
+    if how == "closed":
+        bench.proxy.cut()
+    else:
+        bench.proxy.stalled.set()
     wait_until(lambda: mail.peek().status is not RobotStatus.FOLLOWING, "stopped")
     assert mail.peek().t_stop - began <= SILENCE + LATE
-    assert "connection" in program.wait_for("lost")
+    assert program.wait_for("lost") in ("link_closed", "link_silent", "process_silent")
     wait_until(lambda: not bench.server.served, "free for the next client")
+    bench.proxy.stalled.clear()
     with hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig:
         rest = rig.robots["panda"].state().q_set
         rig.clock.sleep(0.3)
@@ -212,9 +281,13 @@ def test_a_gripper_stops_when_its_program_is_gone_and_the_next_program_moves_it(
         assert rig.robots["panda"].gripper.move(0.5 * rest, timeout=10.0).width == pytest.approx(0.5 * rest, abs=1e-3)
 
 
-def test_frames_that_are_lost_repeated_or_out_of_order_change_nothing(bench: Bench) -> None:
+def test_frames_lost_repeated_or_out_of_order_and_a_wall_clock_that_steps_change_nothing(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.proxy.delay = 0.01
     bench.drive()
+    steps = itertools.cycle((0.0, 3600.0))
+    monkeypatch.setattr(time, "time", lambda: next(steps))
     bench.proxy.trouble = 0.1
     q = bench.servo().q_set[0]
     wait_until(lambda: abs(bench.servo().q_set[0] - q) > 0.3, "the arm moves on")

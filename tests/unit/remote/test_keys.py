@@ -175,6 +175,7 @@ def test_a_computer_without_openssl_says_what_to_install(tmp_path: Path, monkeyp
         ("foreign host", "person", "certificate_foreign"),
         ("other host", "person", "certificate_wrong_name"),
         ("revoking host", "person", "policy_error"),
+        ("host", "viewer", "policy_error"),
     ],
 )
 def test_a_policy_is_served_to_those_with_certificates(
