@@ -7,12 +7,14 @@ import contextlib
 import ipaddress
 import json
 import math
+import os
 import signal
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from hal.errors import HalError
@@ -49,13 +51,7 @@ def run_emulator(
         arguments: The command line; None for that of this program.
         start: Starts it, for these options; the stack is closed at the end.
     """
-    parser = argparse.ArgumentParser(
-        prog=f"hal emulate {kind}",
-        description=f"{description} What the manuals leave open is assumed; it proves nothing about a real one.",
-        epilog="commands, typed here or sent to the control port; with several devices, the arm's name first:\n"
-        + commands,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser(kind, description, commands, "; with several devices, the arm's name first")
     _add_rig_options(parser)
     options = parser.parse_args(arguments)
     ends = note_signals()
@@ -73,6 +69,16 @@ def run_emulator(
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def make_parser(kind: str, description: str, commands: str, more: str = "") -> argparse.ArgumentParser:
+    """Return the command line of an emulator; the arguments are those of :func:`run_emulator`."""
+    return argparse.ArgumentParser(
+        prog=f"hal emulate {kind}",
+        description=f"{description} What the manuals leave open is assumed; it proves nothing about a real one.",
+        epilog=f"commands, typed here or sent to the control port{more}:\n{commands}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
 
 
 def _add_rig_options(parser: argparse.ArgumentParser) -> None:
@@ -201,6 +207,54 @@ def answer_line(execute: Execute, line: str) -> dict[str, Any]:
         return {"ok": False, "error": str(error)}
 
 
+Run = Callable[[Any, "list[str]"], "Mapping[str, Any] | None"]
+"""Executes a command on a target with its words, and returns its answer. Raises ValueError and IndexError."""
+
+
+class Command(NamedTuple):
+    """A command of an emulator: how it is written, what it does, and how."""
+
+    usage: str
+    meaning: str
+    run: Run
+
+
+def make_commands(*commands: Command) -> dict[str, Command]:
+    """Return a table of commands by their names; ``kill`` and ``help`` are added."""
+    more = (
+        Command("kill", "end this program at once", lambda _, __: os.kill(os.getpid(), signal.SIGKILL)),
+        Command("help", "this table", lambda _, __: {"text": help_text(table)}),
+    )
+    table = {command.usage.split()[0]: command for command in (*commands, *more)}
+    return table
+
+
+def help_text(table: Mapping[str, Command]) -> str:
+    """Return a table of commands as text."""
+    width = max(len(command.usage) for command in table.values())
+    return "\n".join(f"  {command.usage:{width}}  {command.meaning}" for command in table.values())
+
+
+def run_command(table: Mapping[str, Command], target: object, words: Sequence[str]) -> dict[str, Any]:
+    """Execute a command, and return its answer. Raises ValueError if it is invalid."""
+    command = table.get(words[0] if words else "")
+    if command is None:
+        raise ValueError(f"there is no command {' '.join(words[:1])!r}; help lists them")
+    try:
+        if len(words) > len(command.usage.split()) and "..." not in command.usage:
+            raise ValueError("too many words")
+        return dict(command.run(target, list(words[1:])) or {})
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"{words[0]}: {error}; usage: {command.usage}") from None
+
+
+def assign(place: str, read: Callable[[str], Any]) -> Run:
+    """Return what puts a command's word, once it is read, at an attribute of the target, as ``faults.delay``."""
+    owner, _, name = place.rpartition(".")
+    find: Callable[[Any], Any] = attrgetter(owner) if owner else lambda target: target
+    return lambda target, words: setattr(find(target), name, read(words[0]))
+
+
 def read_switch(word: str) -> bool:
     """Return whether a word is on. Raises ValueError unless it is on or off."""
     if word not in ("on", "off"):
@@ -217,6 +271,16 @@ def read_number(word: str, least: float, most: float) -> float:
     if not least <= value <= most:
         raise ValueError(f"must be {least:g} to {most:g}, not {word}")
     return value
+
+
+def between(least: float, most: float) -> Callable[[str], float]:
+    """Return the reader of a number in a range; see :func:`read_number`."""
+    return lambda word: read_number(word, least, most)
+
+
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """Return the reader of a whole number in a range."""
+    return lambda word: int(read_number(word, least, most))
 
 
 def read_end(word: str) -> float:

@@ -19,31 +19,18 @@ from hal.errors import HalError
 
 from .control import (
     CONTROL_PORT,
+    Command,
     EmulatorControl,
     answer_line,
+    assign,
+    between,
     note_signals,
     read_loopback,
     read_number,
+    run_command,
     serve_prompt,
 )
 from .shared_world import PRIORITY, ArmInWorld, enter_world, find_arm, raise_priority
-
-__all__ = ["Client", "NetworkArm", "NetworkController", "help_text", "run_program"]
-
-Act = Callable[[list[str]], object]
-"""Carries out a command with its words."""
-
-COMMANDS = {
-    "lose": ("SHARE", "leave out this share of the states"),
-    "late": ("S", "send states so much later"),
-    "mute": ("S", "answer no commands; states go on"),
-    "silence": ("S", "answer nothing and send nothing; the connections stay"),
-    "cut": ("S", "close all connections, and accept none"),
-    "refresh": ("", "end all faults, and put the arm back where it began"),
-    "status": ("", "what the arm does, and the last events"),
-    "help": ("", "this list"),
-}
-"""Commands of every such emulator -> what they take, and mean."""
 
 
 class NetworkController:
@@ -94,8 +81,8 @@ class NetworkArm:
     """
 
     PORTS: ClassVar[tuple[int, ...]]
-    COMMANDS: ClassVar[Mapping[str, tuple[str, str]]]
-    """Commands of the control port -> what they take, and mean."""
+    COMMANDS: ClassVar[Mapping[str, Command]]
+    """Commands of the control port; their target is this object."""
     LONGEST: ClassVar[int] = 1 << 20
     """Most bytes that a client may send without a whole message."""
     client: ClassVar[type[Client]] = Client
@@ -118,7 +105,7 @@ class NetworkArm:
         self._listen_all()
 
     def _calm(self) -> None:
-        self._lose = self._delay = self._mute_until = self._silent_until = self._cut_until = 0.0
+        self.lose = self.delay = self.mute_until = self.silent_until = self.cut_until = 0.0
 
     def _listen(self, port: int) -> socket.socket:
         listener = socket.create_server((self.host, port))
@@ -143,7 +130,7 @@ class NetworkArm:
             if self.world is not None:
                 self.exchange(self.world)
             now = time.monotonic()
-            if now >= self._silent_until:
+            if now >= self.silent_until:
                 while self._late and self._late[0][0] <= now:
                     self.send(*self._late.popleft()[1:])
                 self.publish()
@@ -171,10 +158,6 @@ class NetworkArm:
         """Send what is due after a cycle."""
         raise NotImplementedError
 
-    def acts(self) -> dict[str, Act]:
-        """Return how each of its own commands is carried out."""
-        raise NotImplementedError
-
     def describe(self) -> dict[str, Any]:
         """Return what the arm does."""
         raise NotImplementedError
@@ -190,9 +173,9 @@ class NetworkArm:
         end = time.monotonic() + wait
         while True:
             now = time.monotonic()
-            if not self._listeners and now >= self._cut_until:
+            if not self._listeners and now >= self.cut_until:
                 self._listen_all()
-            deaf = now < max(self._silent_until, self._mute_until)
+            deaf = now < max(self.silent_until, self.mute_until)
             for key, _ in self._selector.select(max(0.0, end - now) if not deaf else 0.0):
                 if isinstance(key.data, int):
                     self._accept(key.fileobj, key.data)  # type: ignore[arg-type]
@@ -249,10 +232,10 @@ class NetworkArm:
 
     def send_state(self, client: Client, data: bytes) -> None:
         """Send a state, unless it is lost; late if they are."""
-        if self._lose and self._random.random() < self._lose:
+        if self.lose and self._random.random() < self.lose:
             self.lost += 1
-        elif self._delay or self._late:
-            self._late.append((time.monotonic() + self._delay, client, data))
+        elif self.delay or self._late:
+            self._late.append((time.monotonic() + self.delay, client, data))
         else:
             self.send(client, data)
 
@@ -260,30 +243,15 @@ class NetworkArm:
 
     def execute(self, line: str) -> dict[str, Any]:
         """Execute a command of :attr:`COMMANDS`. Raises ValueError for a wrong one."""
-        name, *words = line.split() or [""]
-        if name not in self.COMMANDS:
-            raise ValueError(f"there is no command {name!r}; help lists them")
-        if name == "help":
-            return {"text": help_text(self.COMMANDS)}
-        if name == "status":
-            return {**self.describe(), "events": self.controller.events, "now": self.controller.now, "lost": self.lost}
-        acts: dict[str, Act] = {
-            "lose": lambda words: setattr(self, "_lose", read_number(words[0], 0.0, 1.0)),
-            "late": lambda words: setattr(self, "_delay", read_number(words[0], 0.0, 10.0)),
-            "mute": lambda words: setattr(self, "_mute_until", read_time(words)),
-            "silence": lambda words: setattr(self, "_silent_until", read_time(words)),
-            "cut": lambda words: self._cut(read_time(words)),
-            "refresh": lambda _: self._refresh(),
-            **self.acts(),
-        }
-        try:
-            acts[name](words)
-        except (ValueError, IndexError) as error:
-            raise ValueError(f"{error}; usage: {name} {self.COMMANDS[name][0]}".rstrip()) from None
-        return {}
+        return run_command(self.COMMANDS, self, line.split())
 
-    def _cut(self, until: float) -> None:
-        self._cut_until = until
+    def report(self) -> dict[str, Any]:
+        """Return what the arm does, and the last events."""
+        return {**self.describe(), "events": self.controller.events, "now": self.controller.now, "lost": self.lost}
+
+    def cut(self, until: float) -> None:
+        """Close all connections, and accept none until a time, s on the monotonic clock."""
+        self.cut_until = until
         for listener in self._listeners:
             self._selector.unregister(listener)
             listener.close()
@@ -291,7 +259,8 @@ class NetworkArm:
         for client in [client for client in self.clients if client.port != CONTROL_PORT]:
             self.drop(client)
 
-    def _refresh(self) -> None:
+    def refresh(self) -> None:
+        """End all faults, and put the arm back where it began."""
         self._calm()
         self.controller = self.renew()
 
@@ -302,14 +271,21 @@ def take_lines(client: Client) -> list[str]:
     return [line.decode(errors="replace").strip() for line in lines]
 
 
-def read_time(words: list[str]) -> float:
+def _read_time(word: str) -> float:
     """Return the time in so many s. Raises ValueError."""
-    return time.monotonic() + read_number(words[0], 0.0, 1e9)
+    return time.monotonic() + read_number(word, 0.0, 1e9)
 
 
-def help_text(commands: Mapping[str, tuple[str, str]]) -> str:
-    """Return a table of commands."""
-    return "\n".join(f"  {name + ' ' + usage:18s} {meaning}" for name, (usage, meaning) in commands.items())
+COMMANDS = (
+    Command("lose SHARE", "leave out this share of the states", assign("lose", between(0.0, 1.0))),
+    Command("late S", "send states so much later", assign("delay", between(0.0, 10.0))),
+    Command("mute S", "answer no commands; states go on", assign("mute_until", _read_time)),
+    Command("silence S", "answer nothing and send nothing; the connections stay", assign("silent_until", _read_time)),
+    Command("cut S", "close all connections, and accept none", lambda arm, words: arm.cut(_read_time(words[0]))),
+    Command("refresh", "end all faults, and put the arm back where it began", lambda arm, _: arm.refresh()),
+    Command("status", "what the arm does, and the last events", lambda arm, _: arm.report()),
+)
+"""Commands of every such emulator."""
 
 
 def run_program(

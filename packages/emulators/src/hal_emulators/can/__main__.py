@@ -14,10 +14,10 @@ except ModuleNotFoundError:
 
 from hal.errors import ControlTaken
 from hal.lock import DeviceLock
-from hal_emulators.control import Started, run_emulator
+from hal_emulators.control import Started, help_text, run_emulator
 from hal_emulators.shared_world import has_world, run_world
 
-from .console import help_text
+from .console import COMMANDS
 from .server import CanEmulator
 
 _WHAT = "Emulates every arm on a CAN bus in a rig: Damiao motors or a PiPER, with mass, gravity and friction."
@@ -29,7 +29,7 @@ _locks: list[DeviceLock] = []
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
-    return run_emulator("can", _WHAT, help_text(), arguments, _start)
+    return run_emulator("can", _WHAT, help_text(COMMANDS), arguments, _start)
 
 
 def _start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Started:

@@ -6,35 +6,30 @@ this computer only; a line holds a command, and its answer is a line of JSON.
 
 from __future__ import annotations
 
-import os
-import signal
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from hal_emulators.control import read_end, read_number, read_switch
+from hal_emulators.control import (
+    Command,
+    assign,
+    between,
+    make_commands,
+    read_end,
+    read_number,
+    read_switch,
+    run_command,
+)
 
-from .server import CanEmulator, EmulatedArm, EmulatedBus
+from .server import CanEmulator, EmulatedArm, EmulatedBus, FrameFaults
 
 _MOST = 1e4
 """Greatest number of a command, in SI units."""
 
 
 class _Target(NamedTuple):
-    emulator: CanEmulator
     arm: EmulatedArm
     bus: EmulatedBus
-
-
-_Run = Callable[[_Target, list[str]], dict[str, Any] | None]
-
-
-class EmulatorCommand(NamedTuple):
-    """One command of the table."""
-
-    usage: str
-    meaning: str
-    run: _Run
+    faults: FrameFaults
 
 
 # Values of a command. A wrong one is a ValueError, in words.
@@ -68,7 +63,7 @@ def _motor(target: _Target, word: str, other: str = "") -> int:
 
 
 def _lose(target: _Target, words: list[str]) -> None:
-    faults = target.bus.faults[target.arm.name]
+    faults = target.faults
     if words[0] == "next":
         motor = _motor(target, words[2]) if len(words) > 2 else 0
         faults.lose_next[motor] = _int(words[1], "the number of replies", 0, 1_000_000)
@@ -76,21 +71,9 @@ def _lose(target: _Target, words: list[str]) -> None:
         faults.lost_share = read_number(words[0], 0.0, 1.0)
 
 
-def _late(target: _Target, words: list[str]) -> None:
-    target.bus.faults[target.arm.name].delay = read_number(words[0], 0.0, _MOST)
-
-
-def _double(target: _Target, words: list[str]) -> None:
-    target.bus.faults[target.arm.name].copies = 2 if read_switch(words[0]) else 1
-
-
 def _silent(target: _Target, words: list[str]) -> None:
     number = 0 if words[0] == "all" else _motor(target, words[0], "or all")
-    target.bus.faults[target.arm.name].silent_until[number] = read_end(words[1])
-
-
-def _cut(target: _Target, words: list[str]) -> None:
-    target.bus.cut_until = read_end(words[0])
+    target.faults.silent_until[number] = read_end(words[1])
 
 
 def _frame(target: _Target, words: list[str]) -> None:
@@ -104,10 +87,6 @@ def _frame(target: _Target, words: list[str]) -> None:
         raise ValueError(f"the data must be up to {longest} bytes in hexadecimal, such as 01ff, not {words[1]!r}")
     for _ in range(_int(words[2], "the number of frames", 0, 100_000) if len(words) > 2 else 1):
         target.bus.send(id, data)
-
-
-def _stall(target: _Target, words: list[str]) -> None:
-    target.bus.stall = read_number(words[0], 0.0, _MOST)
 
 
 # Faults of motors.
@@ -129,14 +108,6 @@ def _temperature(target: _Target, words: list[str]) -> None:
 
 
 # Mechanics.
-
-
-def _masses(target: _Target, words: list[str]) -> None:
-    target.arm.plant.load(mass_factor=read_number(words[0], 0.0, _MOST))
-
-
-def _friction(target: _Target, words: list[str]) -> None:
-    target.arm.plant.friction = read_number(words[0], 0.0, _MOST)
 
 
 def _payload(target: _Target, words: list[str]) -> None:
@@ -192,61 +163,53 @@ def _stats(target: _Target, words: list[str]) -> dict[str, Any]:
 
 def _reset(target: _Target, words: list[str]) -> None:
     """Take every fault away; what was done to the motors' registers stays."""
-    target.bus.faults[target.arm.name].__init__()  # type: ignore[misc]
+    target.faults.__init__()  # type: ignore[misc]
     target.bus.cut_until = 0.0
     target.arm.plant.friction = 1.0
     target.arm.plant.load(mass_factor=1.0, payload=(0.0, (0.0, 0.0, 0.0)))
     target.arm.plant.push[:] = 0.0
 
 
-COMMANDS = {
-    "lose": EmulatorCommand("lose P | next N [MOTOR]", "lose that share of the replies, or exactly the next N", _lose),
-    "late": EmulatorCommand("late S", "send replies S seconds late", _late),
-    "double": EmulatorCommand("double on|off", "send every reply twice", _double),
-    "silent": EmulatorCommand("silent MOTOR|all S|on|off", "neither hear nor answer", _silent),
-    "cut": EmulatorCommand("cut S|on|off", "let no frame pass, either way", _cut),
-    "frame": EmulatorCommand("frame ID HEX [N]", "send a frame of your own, N times", _frame),
-    "stall": EmulatorCommand("stall S", "stop the emulator itself", _stall),
-    "status": EmulatorCommand(
+COMMANDS = make_commands(
+    Command("lose P | next N [MOTOR]", "lose that share of the replies, or exactly the next N", _lose),
+    Command("late S", "send replies S seconds late", assign("faults.delay", between(0.0, _MOST))),
+    Command("double on|off", "send every reply twice", assign("faults.copies", lambda word: 1 + read_switch(word))),
+    Command("silent MOTOR|all S|on|off", "neither hear nor answer", _silent),
+    Command("cut S|on|off", "let no frame pass, either way", assign("bus.cut_until", read_end)),
+    Command("frame ID HEX [N]", "send a frame of your own, N times", _frame),
+    Command("stall S", "stop the emulator itself", assign("bus.stall", between(0.0, _MOST))),
+    Command(
         "status MOTOR CODE",
         "give a motor a status, hex: 8 to E; a PiPER: its joint's flags, with MOTOR 0 the arm's status",
         _status,
     ),
-    "register": EmulatorCommand("register MOTOR NAME VALUE", "change a register, as VMAX or TIMEOUT", _register),
-    "temperature": EmulatorCommand("temperature MOTOR C C", "report these: electronics, motor", _temperature),
-    "power": EmulatorCommand("power", "switch all motors off and on again", lambda target, _: target.arm.restart()),
-    "masses": EmulatorCommand("masses FACTOR", "multiply the masses of the arm", _masses),
-    "friction": EmulatorCommand("friction FACTOR", "multiply the Coulomb friction of the joints", _friction),
-    "payload": EmulatorCommand("payload KG [X Y Z]", "fix a mass to the tool's link, m", _payload),
-    "place": EmulatorCommand("place [Q ...]", "switch off, and hold the arm there until its motors are on", _place),
-    "push": EmulatorCommand("push JOINT NM", "push a joint with this torque, until 0", _push),
-    "object": EmulatorCommand("object M|none", "put an object of this width between the fingers", _object),
-    "state": EmulatorCommand("state", "motion, motors, last commands", _state),
-    "stats": EmulatorCommand("stats [reset]", "greatest speeds and counters", _stats),
-    "reset": EmulatorCommand("reset", "end all faults of frames and mechanics", _reset),
-    "kill": EmulatorCommand("kill", "end this program at once", lambda _, __: os.kill(os.getpid(), signal.SIGKILL)),
-    "help": EmulatorCommand("help", "this table", lambda _, __: {"text": help_text()}),
-}
-
-
-def help_text() -> str:
-    """Return the table of commands."""
-    width = max(len(command.usage) for command in COMMANDS.values())
-    return "\n".join(f"  {command.usage:{width}}  {command.meaning}" for command in COMMANDS.values())
+    Command("register MOTOR NAME VALUE", "change a register, as VMAX or TIMEOUT", _register),
+    Command("temperature MOTOR C C", "report these: electronics, motor", _temperature),
+    Command("power", "switch all motors off and on again", lambda target, _: target.arm.restart()),
+    Command(
+        "masses FACTOR",
+        "multiply the masses of the arm",
+        lambda target, words: target.arm.plant.load(mass_factor=read_number(words[0], 0.0, _MOST)),
+    ),
+    Command(
+        "friction FACTOR",
+        "multiply the Coulomb friction of the joints",
+        assign("arm.plant.friction", between(0.0, _MOST)),
+    ),
+    Command("payload KG [X Y Z]", "fix a mass to the tool's link, m", _payload),
+    Command("place [Q ...]", "switch off, and hold the arm there until its motors are on", _place),
+    Command("push JOINT NM", "push a joint with this torque, until 0", _push),
+    Command("object M|none", "put an object of this width between the fingers", _object),
+    Command("state", "motion, motors, last commands", _state),
+    Command("stats [reset]", "greatest speeds and counters", _stats),
+    Command("reset", "end all faults of frames and mechanics", _reset),
+)
 
 
 def execute(emulator: CanEmulator, words: list[str]) -> dict[str, Any]:
     """Execute a command, and return its answer. Raises ValueError if it is invalid."""
-    arms = emulator.arms
-    arm = arms[words[0]] if words and words[0] in arms else next(iter(arms.values()))
-    verb, *rest = words[1:] if words and words[0] in arms else words or [""]
-    command = COMMANDS.get(verb)
-    if command is None:
-        raise ValueError(f"there is no command {verb!r}; help lists them")
+    named = bool(words) and words[0] in emulator.arms
+    arm = emulator.arms[words[0]] if named else next(iter(emulator.arms.values()))
     bus = emulator.bus_of(arm)
-    try:
-        with bus.lock:
-            return command.run(_Target(emulator, arm, bus), rest) or {}
-    except (ValueError, IndexError) as error:
-        reason = f"usage: {command.usage}" if isinstance(error, IndexError) else error
-        raise ValueError(f"{verb}: {reason}") from None
+    with bus.lock:
+        return run_command(COMMANDS, _Target(arm, bus, bus.faults[arm.name]), words[named:])

@@ -7,17 +7,17 @@ import gc
 import ipaddress
 import sys
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hal.config.data_files import find_data
 from hal.drivers.franka.limits import LIMITS
 from hal.errors import HalError
-from hal_emulators.control import CONTROL_PORT, CommandPort, note_signals, serve_prompt
+from hal_emulators.control import CONTROL_PORT, CommandPort, help_text, make_parser, note_signals, serve_prompt
 from hal_emulators.shared_world import ArmInWorld, enter_world, find_arm
 
 from .arm import EmulatedArm, RobotFiles
-from .console import Executor
-from .faults import help_text
+from .console import COMMANDS, Executor
+from .hand import HandServer
 from .journal import Journal
 from .model_library import write_model_library
 from .plant import IdealPlant, LaggingPlant, RigidBody, arm_only
@@ -65,7 +65,7 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
     server = ArmServer(options.host, arm, files, pacing, options.seed)
     stack.callback(server.close)
     server.world = world
-    hand = _hand(options, world)
+    hand = None if options.no_hand else HandServer(options.host, world=world)
     if hand is not None:
         hand.start()
         stack.callback(hand.stop)
@@ -83,13 +83,11 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="hal emulate franka",
-        description="Emulates a Franka arm and its hand for the vendor's own client libraries. Limits and timing are "
-        "checked as documented; what is not documented is assumed. It proves nothing about a real arm.",
-        epilog="commands, typed here or sent to the control port:\n" + help_text(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    what = (
+        "Emulates a Franka arm and its hand for the vendor's own client libraries. Limits and timing are checked as "
+        "documented."
     )
+    parser = make_parser("franka", what, help_text(COMMANDS))
     add = parser.add_argument
     add("--robot", choices=sorted(_ROBOTS), default="fr3", help="which arm (%(default)s)")
     add("--host", default="127.0.0.2", type=_address, help="address to listen on; the ports are fixed (%(default)s)")
@@ -119,14 +117,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
     add("--quiet", action="store_true", help="print no events")
     return parser
-
-
-def _hand(options: argparse.Namespace, world: ArmInWorld | None) -> Any:
-    if options.no_hand:
-        return None
-    from .hand import HandServer
-
-    return HandServer(options.host, world=world)
 
 
 def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | None:

@@ -1,17 +1,26 @@
-"""What each command of the emulator does, from its prompt or its control port; their table is in :mod:`.faults`."""
+"""Commands of the emulator, from its prompt or its control port."""
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from operator import attrgetter
+from typing import Any
 
 from hal.drivers.franka.flags import flag_index
-from hal_emulators.control import read_number, read_switch, read_words
+from hal_emulators.control import (
+    Command,
+    Run,
+    assign,
+    between,
+    make_commands,
+    read_switch,
+    read_words,
+    run_command,
+    whole,
+)
 
-from .faults import COMMANDS, help_text
+from .hand import HandServer
 from .journal import Counters
 from .server import ArmServer
 
@@ -20,156 +29,155 @@ Answer = dict[str, Any]
 
 _MAX_DURATION = 600.0
 """Longest duration of a fault, s."""
-_NOTED = frozenset(command.usage.split()[0] for command in COMMANDS if command.noted)
-
-
-class HandCommands(Protocol):
-    """Interface of the hand's server to the console."""
-
-    def command(self, words: list[str]) -> dict[str, Any]:
-        """Execute a command of the hand; ``error`` in the answer reports a failure."""
 
 
 class Executor:
     """Executes commands on a server and on its hand, if there is one."""
 
-    def __init__(self, server: ArmServer, hand: HandCommands | None) -> None:
-        self._server = server
-        self._hand = hand
-        self._verbs: dict[str, Callable[[Words], Answer | None]] = {
-            "silence": self._silence,
-            "lose-states": lambda words: server.faults.states.set(words),
-            "lose-commands": lambda words: server.faults.commands.set(words),
-            "report-lag": self._report_lag,
-            "report-noise": self._report_noise,
-            "report-measured": self._report_measured,
-            "spoil": self._spoil,
-            "unrest": lambda words: server.arm.unrest.set(None if words == ["off"] else int(*_exactly(words, 1))),
-            "truncate": self._truncate,
-            "reflex": self._reflex,
-            "user-stop": lambda words: server.arm.user_stop(read_switch(*_exactly(words, 1))),
-            "emergency-stop": lambda words: server.arm.emergency_stop(read_switch(*_exactly(words, 1))),
-            "guiding": lambda words: server.arm.guiding(read_switch(*_exactly(words, 1))),
-            "place": self._place,
-            "stall": lambda words: time.sleep(_seconds(words)),
-            "slow-reply": self._slow_reply,
-            "no-move-reply": self._no_move_reply,
-            "version": self._version,
-            "kill": lambda words: os.kill(os.getpid(), signal.SIGKILL),
-            "restart": self._restart,
-            "hand": self._to_hand,
-            "state": self._state,
-            "stats": self._stats,
-            "reset-stats": self._reset_stats,
-            "settings": lambda words: {"settings": server.arm.settings.given},
-            "log": self._log,
-            "help": lambda words: {"text": help_text()},
-        }
+    def __init__(self, server: ArmServer, hand: HandServer | None) -> None:
+        self.server, self.hand = server, hand
+        self.arm, self.faults = server.arm, server.faults
 
     def execute_line(self, line: str) -> Answer:
         """Execute a command between two cycles of the server, and return its answer. Raises ValueError."""
         words = read_words(line)
-        return self._server.call(lambda: self.execute(words))
+        return self.server.call(lambda: self._execute(words))
 
-    def execute(self, words: Words) -> Answer:
-        """Execute a command, and return its answer. Raises ValueError if it is invalid."""
-        verb, *rest = words or [""]
-        if verb not in self._verbs:
-            raise ValueError(f"no command {verb!r}; help lists them")
-        try:
-            answer = self._verbs[verb](rest) or {}
-        except (ValueError, IndexError) as error:
-            raise ValueError(f"{verb}: {error}") from None
-        if verb in _NOTED:
-            self._server.arm.journal.record("command", "command: " + " ".join(words))
+    def _execute(self, words: Words) -> Answer:
+        answer = run_command(COMMANDS, self, words)
+        if words[0] in _NOTED:
+            self.arm.journal.record("command", "command: " + " ".join(words))
         return answer
 
-    def _silence(self, words: Words) -> None:
-        self._server.faults.silent_until = time.monotonic() + _seconds(words)
 
-    def _report_lag(self, words: Words) -> None:
-        reports = self._server.arm.reports
-        (word,) = _exactly(words, 1)
-        if not 0 <= int(word) <= reports.MAX_LAG:
-            raise ValueError(f"takes 0 to {reports.MAX_LAG} cycles")
-        reports.lag = int(word)
-
-    def _report_noise(self, words: Words) -> None:
-        self._server.arm.reports.noise = read_number(_exactly(words, 1)[0], 0.0, 1.0)
-
-    def _report_measured(self, words: Words) -> None:
-        self._server.arm.reports.measured = read_switch(*_exactly(words, 1))
-
-    def _spoil(self, words: Words) -> None:
-        field, value = _exactly(words, 2)
-        if value not in ("nan", "inf", "off"):
-            raise ValueError("takes nan, inf or off")
-        self._server.arm.spoil(field, None if value == "off" else float(value))
-
-    def _truncate(self, words: Words) -> None:
-        self._server.faults.truncate = read_switch(*_exactly(words, 1))
-
-    def _reflex(self, words: Words) -> None:
-        (name,) = _exactly(words, 1)
-        self._server.arm.reflex(flag_index(name))
-
-    def _place(self, words: Words) -> None:
-        arm = self._server.arm
-        q = [float(word) for word in words]
-        limits = zip(q, arm.limits.lower, arm.limits.upper, strict=True) if q else ()
-        if not all(lower <= position <= upper for position, lower, upper in limits):
-            raise ValueError("beyond the arm's range")
-        arm.place(q or None)
-
-    def _slow_reply(self, words: Words) -> None:
-        self._server.faults.slow_reply = _seconds(words)
-
-    def _no_move_reply(self, words: Words) -> None:
-        self._server.arm.no_move_reply = read_switch(*_exactly(words, 1))
-
-    def _version(self, words: Words) -> None:
-        (number,) = _exactly(words, 1)
-        version = int(number)
-        if not 0 <= version < 65536:
-            raise ValueError("a version is from 0 to 65535")
-        self._server.faults.version = version
-
-    def _restart(self, words: Words) -> None:
-        away = _seconds(words) if words else 0.0
-        self._server.restart(away)
-        if self._hand is not None:
-            self._to_hand(["restart", str(away)])
-
-    def _to_hand(self, words: Words) -> Answer:
-        if self._hand is None:
-            raise ValueError("this emulator has no hand")
-        answer = self._hand.command(words)
-        if "error" in answer:
-            raise ValueError(answer["error"])
-        return answer
-
-    def _state(self, words: Words) -> Answer:
-        session = self._server.session
-        connected = session is not None and session.connected
-        return {**self._server.arm.report(), "connected": connected, "t": time.monotonic()}
-
-    def _stats(self, words: Words) -> Answer:
-        arm = self._server.arm
-        return {**arm.counters.report(), "limits": arm.checker.report()}
-
-    def _reset_stats(self, words: Words) -> None:
-        self._server.arm.counters = Counters()
-        self._server.arm.checker.reset()
-
-    def _log(self, words: Words) -> Answer:
-        return {"events": self._server.arm.journal.events(int(words[0]) if words else 100)}
+_seconds = between(0.0, _MAX_DURATION)
 
 
-def _exactly(words: Words, count: int) -> Words:
-    if len(words) != count:
-        raise ValueError(f"takes {count} argument{'s' if count > 1 else ''}")
-    return words
+def _call(method: str, read: Callable[[str], Any]) -> Run:
+    """Return what calls a method of the executor's parts, such as ``arm.guiding``, with a command's word."""
+    return lambda executor, words: attrgetter(method)(executor)(read(words[0]))
 
 
-def _seconds(words: Words) -> float:
-    return read_number(_exactly(words, 1)[0], 0.0, _MAX_DURATION)
+def _spoil(executor: Executor, words: Words) -> None:
+    field, value = words
+    if value not in ("nan", "inf", "off"):
+        raise ValueError("takes nan, inf or off")
+    executor.arm.spoil(field, None if value == "off" else float(value))
+
+
+def _place(executor: Executor, words: Words) -> None:
+    arm = executor.arm
+    q = [float(word) for word in words]
+    limits = zip(q, arm.limits.lower, arm.limits.upper, strict=True) if q else ()
+    if not all(lower <= position <= upper for position, lower, upper in limits):
+        raise ValueError("beyond the arm's range")
+    arm.place(q or None)
+
+
+def _restart(executor: Executor, words: Words) -> None:
+    away = _seconds(words[0]) if words else 0.0
+    executor.server.restart(away)
+    if executor.hand is not None:
+        executor.hand.command(["restart", str(away)])
+
+
+def _to_hand(executor: Executor, words: Words) -> Answer:
+    if executor.hand is None:
+        raise ValueError("this emulator has no hand")
+    return executor.hand.command(words)
+
+
+def _state(executor: Executor, words: Words) -> Answer:
+    session = executor.server.session
+    connected = session is not None and session.connected
+    return {**executor.arm.report(), "connected": connected, "t": time.monotonic()}
+
+
+def _stats(executor: Executor, words: Words) -> Answer:
+    return {**executor.arm.counters.report(), "limits": executor.arm.checker.report()}
+
+
+def _reset_stats(executor: Executor, words: Words) -> None:
+    executor.arm.counters = Counters()
+    executor.arm.checker.reset()
+
+
+def _log(executor: Executor, words: Words) -> Answer:
+    return {"events": executor.arm.journal.events(int(words[0]) if words else 100)}
+
+
+_FAULTS = (
+    Command(
+        "silence S",
+        "send no states for S seconds; the client's library gives up after 1 s",
+        assign("faults.silent_until", lambda word: time.monotonic() + _seconds(word)),
+    ),
+    Command(
+        "lose-states P | next N",
+        "lose that share (0..1) of the states, or exactly the next N",
+        lambda executor, words: executor.faults.states.set(words),
+    ),
+    Command(
+        "lose-commands P | next N",
+        "the same for the client's commands",
+        lambda executor, words: executor.faults.commands.set(words),
+    ),
+    Command(
+        "report-lag N", "report q_d, dq_d and ddq_d N cycles late (0 to 10)", assign("arm.reports.lag", whole(0, 10))
+    ),
+    Command(
+        "report-noise S",
+        "add noise to the reported q_d: normal, S rad",
+        assign("arm.reports.noise", between(0.0, 1.0)),
+    ),
+    Command(
+        "report-measured on|off",
+        "report measured positions and speeds as q_d and dq_d",
+        assign("arm.reports.measured", read_switch),
+    ),
+    Command("spoil FIELD nan|inf|off", "report that as the first number of a field of the state, as `tau_J`", _spoil),
+    Command(
+        "unrest SEED|off",
+        "hold the arm 0.1 to 1 mrad off its set-points, chosen at random, swinging by up to 0.08 rad/s",
+        _call("arm.unrest.set", lambda word: None if word == "off" else int(word)),
+    ),
+    Command("truncate on|off", "send states that are one byte too short", assign("faults.truncate", read_switch)),
+    Command("stall S", "stop the emulator itself for S seconds", lambda _, words: time.sleep(_seconds(words[0]))),
+    Command(
+        "slow-reply S",
+        "process requests S seconds after their arrival (0: at once)",
+        assign("faults.slow_reply", _seconds),
+    ),
+    Command(
+        "no-move-reply on|off",
+        "never answer the end of a motion: the client's library then waits forever",
+        assign("arm.no_move_reply", read_switch),
+    ),
+    Command(
+        "version N",
+        "claim to speak protocol N from the next connection on (0: the true one)",
+        assign("faults.version", whole(0, 65535)),
+    ),
+    Command("restart [S]", "drop all connections, and return S seconds later (0) as after switching on", _restart),
+)
+_NOTED = frozenset(command.usage.split()[0] for command in _FAULTS)
+"""Commands that the event log notes; others are visible in it by their effect, or change nothing."""
+
+COMMANDS = make_commands(
+    *_FAULTS,
+    Command(
+        "reflex NAME|INDEX",
+        "raise an error flag: a running motion is aborted, and recovery is required",
+        _call("arm.reflex", flag_index),
+    ),
+    Command("user-stop on|off", "press or release the user stop", _call("arm.user_stop", read_switch)),
+    Command("emergency-stop on|off", "press or release the emergency stop", _call("arm.emergency_stop", read_switch)),
+    Command("guiding on|off", "guide the arm by hand (not during a motion)", _call("arm.guiding", read_switch)),
+    Command("place [Q1 ... Q7]", "put the arm there, rad, or at its start position (not during a motion)", _place),
+    Command("hand ...", "a command of the hand; `hand help` lists them", _to_hand),
+    Command("state", "present state of the arm", _state),
+    Command("stats", "counters, times and the largest share of every limit since the last reset", _stats),
+    Command("reset-stats", "reset the counters", _reset_stats),
+    Command("settings", "settings sent by the client", lambda executor, _: {"settings": executor.arm.settings.given}),
+    Command("log [N]", "the last N events (100)", _log),
+)

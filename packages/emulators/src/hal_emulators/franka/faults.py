@@ -1,74 +1,14 @@
-"""Faults of the robot and its network that can be injected, and the table of commands.
-
-Commands are typed into the emulator's standard input, or sent to its control port (see :mod:`hal_emulators.control`).
-"""
+"""Faults of the robot and its network that can be injected by the commands in :mod:`.console`."""
 
 from __future__ import annotations
 
 import random
 from collections import deque
-from typing import NamedTuple
 
 from .motion import DT, Floats, MotionSample
 
 _SWING = 0.08
 """Share of its distance from the set-point by which an arm in unrest moves back and forth, a cycle each."""
-
-
-class FaultCommand(NamedTuple):
-    """One command of the table."""
-
-    usage: str
-    meaning: str
-    noted: bool = False
-    """Whether the event log notes the command itself; others are visible in it by their effect, or change nothing."""
-
-
-COMMANDS = (
-    FaultCommand("silence S", "send no states for S seconds; the client's library gives up after 1 s", noted=True),
-    FaultCommand("lose-states P | next N", "lose that share (0..1) of the states, or exactly the next N", noted=True),
-    FaultCommand("lose-commands P | next N", "the same for the client's commands", noted=True),
-    FaultCommand("report-lag N", "report q_d, dq_d and ddq_d N cycles late (0 to 10)", noted=True),
-    FaultCommand("report-noise S", "add noise to the reported q_d: normal, S rad", noted=True),
-    FaultCommand("report-measured on|off", "report measured positions and speeds as q_d and dq_d", noted=True),
-    FaultCommand(
-        "spoil FIELD nan|inf|off", "report that as the first number of a field of the state, as `tau_J`", noted=True
-    ),
-    FaultCommand(
-        "unrest SEED|off",
-        "hold the arm 0.1 to 1 mrad off its set-points, chosen at random, swinging by up to 0.08 rad/s",
-        noted=True,
-    ),
-    FaultCommand("truncate on|off", "send states that are one byte too short", noted=True),
-    FaultCommand("reflex NAME|INDEX", "raise an error flag: a running motion is aborted, and recovery is required"),
-    FaultCommand("user-stop on|off", "press or release the user stop"),
-    FaultCommand("emergency-stop on|off", "press or release the emergency stop"),
-    FaultCommand("guiding on|off", "guide the arm by hand (not during a motion)"),
-    FaultCommand("place [Q1 ... Q7]", "put the arm there, rad, or at its start position (not during a motion)"),
-    FaultCommand("stall S", "stop the emulator itself for S seconds", noted=True),
-    FaultCommand("slow-reply S", "process requests S seconds after their arrival (0: at once)", noted=True),
-    FaultCommand(
-        "no-move-reply on|off", "never answer the end of a motion: the client's library then waits forever", noted=True
-    ),
-    FaultCommand("version N", "claim to speak protocol N from the next connection on (0: the true one)", noted=True),
-    FaultCommand("kill", "kill the process"),
-    FaultCommand(
-        "restart [S]", "drop all connections, and return S seconds later (0) as after switching on", noted=True
-    ),
-    FaultCommand("hand ...", "a command of the hand; `hand help` lists them"),
-    FaultCommand("state", "present state of the arm"),
-    FaultCommand("stats", "counters, times and the largest share of every limit since the last reset"),
-    FaultCommand("reset-stats", "reset the counters"),
-    FaultCommand("settings", "settings sent by the client"),
-    FaultCommand("log [N]", "the last N events (100)"),
-    FaultCommand("help", "this table"),
-)
-
-
-def help_text() -> str:
-    """Return the table as text."""
-    width = max(len(command.usage) for command in COMMANDS)
-    return "\n".join(f"{command.usage:<{width}}  {command.meaning}" for command in COMMANDS)
 
 
 class PacketLoss:

@@ -9,11 +9,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from hal_emulators.control import read_number, read_switch
+from hal_emulators.control import Command, assign, between, make_commands, read_number, read_switch, run_command, whole
 from hal_emulators.shared_world import ArmInWorld
 
 from .hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
@@ -27,32 +26,6 @@ from .hand_network import (
     HandStatus,
     hand_response,
 )
-
-# Commands.
-
-HAND_COMMANDS = {
-    "object W|none": "put an object of W m between the fingers, or remove it",
-    "grasp-ends-at-width on|off": "a grasp that meets nothing ends at its width, or closes all the way (the default)",
-    "unhome": "undo the homing, as after switching on",
-    "stop-ignored on|off": "Stop is answered, but has no effect (libfranka, issue 18)",
-    "stop-releases on|off": "Stop ends the pressing force (libfranka, issue 111)",
-    "silence S": "send no states for S seconds",
-    "slow-reply S": "answer everything S seconds later (0: at once)",
-    "fail [N]": "fail the next N motions at once (1)",
-    "version N": "claim to speak this protocol",
-    "temperature T": "report T degrees Celsius",
-    "drop": "close the connection",
-    "restart [S]": "switch off, and on again S seconds later (0.5)",
-    "state": "present state of the hand",
-    "help": "this table",
-}
-"""Usage -> meaning."""
-
-
-def help_text() -> str:
-    """Return the table as text."""
-    width = max(map(len, HAND_COMMANDS))
-    return "\n".join(f"{words:<{width}}  {meaning}" for words, meaning in HAND_COMMANDS.items())
 
 
 @dataclass
@@ -79,8 +52,6 @@ _STEP = 0.01
 """s between two steps of moving fingers."""
 _WORLD_STEP = 0.004
 """The same in a simulated world, in all states."""
-_RESTART = "0.5"
-"""Duration of a restart, s."""
 
 
 class HandServer:
@@ -111,13 +82,13 @@ class HandServer:
             port: Port to listen on.
             world: The simulated world that its arm is in, whose objects the fingers meet.
         """
-        self._world = world
+        self.world = world
         self.period = period
         self.fingers = Fingers(object_width, homed)
         self.faults = HandFaults(version)
         self._requests = {code.name.lower(): 0 for code in HandCode}
         self._newest: dict[str, tuple[float, ...]] = {}
-        self._network = HandNetwork((host, port))
+        self.network = HandNetwork((host, port))
         self._lock = threading.RLock()
         self._ending = threading.Event()
         self._running: HandRequest | None = None
@@ -133,34 +104,24 @@ class HandServer:
 
     def start(self) -> None:
         """Listen, and serve from a thread of its own. Raises OSError if the address is in use."""
-        self._network.listen()
+        self.network.listen()
         self._thread.start()
 
     def stop(self) -> None:
         """Disconnect the client and end. Idempotent."""
         if not self._ending.is_set():
             self._ending.set()
-            self._network.wake()
+            self.network.wake()
             if self._thread.ident is not None:
                 self._thread.join(timeout=5.0)
-            self._network.close()
+            self.network.close()
 
     def command(self, words: list[str]) -> dict[str, Any]:
         """Execute a command (``help`` lists them); return the state after it. Raises ValueError if it is invalid."""
-        if not words or words[0] == "help":
-            return {"text": help_text()}
-        usage = next((usage for usage in HAND_COMMANDS if usage.split()[0] == words[0]), None)
-        if usage is None:
-            raise ValueError(f"no command {words[0]!r} of the hand; help lists them")
-        action: Callable[..., None] = getattr(self, "_do_" + words[0].replace("-", "_"))
         with self._lock:
-            try:
-                action(*words[1:])
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{' '.join(words)}: {error}; usage: {usage}") from None
-            state = self._state()
-        self._network.wake()
-        return state
+            answer = run_command(HAND_COMMANDS, self, words or ["help"]) or self._state()
+        self.network.wake()
+        return answer
 
     def _state(self) -> dict[str, Any]:
         fingers, motion = self.fingers, self.fingers.motion
@@ -171,105 +132,66 @@ class HandServer:
             "force": fingers.force,
             "object": fingers.object_width,
             "motion": None if motion is None else motion.kind.value,
-            "client": self._network.client is not None,
-            "listening": self._network.listening,
+            "client": self.network.client is not None,
+            "listening": self.network.listening,
             "requests": dict(self._requests),  # number of each
             "newest": {name: list(values) for name, values in self._newest.items()},  # their latest arguments
         }
 
-    # Commands.
-
-    def _do_object(self, width: str) -> None:
-        if self._world is not None:
-            raise ValueError("the fingers meet the objects of the simulated world: use rig.world")
-        self.fingers.put(None if width == "none" else read_number(width, 1e-6, FULL_WIDTH))
-
-    def _do_grasp_ends_at_width(self, word: str) -> None:
-        self.fingers.grasp_ends_at_width = read_switch(word)
-
-    def _do_unhome(self) -> None:
-        self.fingers.homed = False
-
-    def _do_stop_ignored(self, word: str) -> None:
-        self.faults.stop_ignored = read_switch(word)
-
-    def _do_stop_releases(self, word: str) -> None:
-        self.faults.stop_releases = read_switch(word)
-
-    def _do_silence(self, seconds: str) -> None:
-        self.faults.silent_until = time.monotonic() + read_number(seconds, 0.0, 1e6)
-
-    def _do_slow_reply(self, seconds: str) -> None:
-        self.faults.slow_reply = read_number(seconds, 0.0, 1e6)
-
-    def _do_fail(self, times: str = "1") -> None:
-        self.faults.failures = int(read_number(times, 0.0, 1e6))
-
-    def _do_version(self, version: str) -> None:
-        self.faults.version = int(read_number(version, 0, 65535))
-
-    def _do_temperature(self, degrees: str) -> None:
-        self.faults.temperature = int(read_number(degrees, 0, 65535))
-
-    def _do_drop(self) -> None:
-        self._network.disconnect()
-
-    def _do_restart(self, seconds: str = _RESTART) -> None:
-        self._back_at = time.monotonic() + read_number(seconds, 0.0, 1e6)
-        self._network.shut()
+    def restart(self, seconds: float) -> None:
+        """Switch off, and on again after a time, s."""
+        self._back_at = time.monotonic() + seconds
+        self.network.shut()
         self._running = None
         self.fingers.switch_off()
-
-    def _do_state(self) -> None:
-        """Do nothing: every answer is the state."""
 
     # The thread.
 
     def _run(self) -> None:
         while not self._ending.is_set():
-            keys = self._network.wait(self._time_to_next())
+            keys = self.network.wait(self._time_to_next())
             with self._lock:
-                came = time.monotonic() if self._world is None else self._world.now
-                self._waiting.extend((came, request) for request in self._network.receive(keys))
+                came = time.monotonic() if self.world is None else self.world.now
+                self._waiting.extend((came, request) for request in self.network.receive(keys))
                 while self._waiting and self._waiting[0][0] <= self._fingers_time():
                     self._serve(self._waiting.popleft()[1])
                 self._step()
 
     def _fingers_time(self) -> float:
         """Return the time of the fingers, s: in a simulated world, the time up to which that is known."""
-        return time.monotonic() if self._world is None else self._world.now_of_fingers
+        return time.monotonic() if self.world is None else self.world.now_of_fingers
 
     def _time_to_next(self) -> float:
         """Return the time until the next step is due, s."""
         with self._lock:
-            now, client = time.monotonic(), self._network.client
+            now, client = time.monotonic(), self.network.client
             due = [now + 1.0]
             if client is not None:
                 due += [self._next_state, client.due]
-            if self._world is not None:
+            if self.world is not None:
                 due.append(now + _WORLD_STEP)
             elif self.fingers.motion is not None:
                 due.append(self._advanced + _STEP)
-            if not self._network.listening:
+            if not self.network.listening:
                 due.append(self._back_at)
             return max(0.0, min(due) - now)
 
     def _step(self) -> None:
         now = time.monotonic()
-        if not self._network.listening and now >= self._back_at:
-            self._network.listen()
+        if not self.network.listening and now >= self._back_at:
+            self.network.listen()
         self._advance()
         if now >= self._next_state:
             self._next_state = max(now, self._next_state + self.period)
             if now >= self.faults.silent_until:
-                self._network.send_state(self._report(now))
-        self._network.send_answers(now)
+                self.network.send_state(self._report(now))
+        self.network.send_answers(now)
 
     def _advance(self) -> None:
         now = max(self._advanced, self._fingers_time())
-        if self._world is not None:
-            self.fingers.meet(self._world.object_width)
-            self._world.fingers = self._advanced, self.fingers.width, self.fingers.pressing
+        if self.world is not None:
+            self.fingers.meet(self.world.object_width)
+            self.world.fingers = self._advanced, self.fingers.width, self.fingers.pressing
         status = self.fingers.advance(now - self._advanced)
         self._advanced = now
         if status is not None:
@@ -300,8 +222,8 @@ class HandServer:
     def _connect(self, request: HandRequest) -> None:
         version, udp_port = map(int, request.values)
         fits = version == self.faults.version
-        if fits and self._network.client is not None:
-            self._network.client.udp_port = udp_port
+        if fits and self.network.client is not None:
+            self.network.client.udp_port = udp_port
             self._next_state = time.monotonic()
         self._answer(request, HandStatus.SUCCESS if fits else HandStatus.FAIL, self.faults.version)
 
@@ -322,9 +244,62 @@ class HandServer:
             self._answer(running, status)
 
     def _answer(self, request: HandRequest, status: HandStatus, version: int | None = None) -> None:
-        client = self._network.client
+        client = self.network.client
         if client is not None:
             client.answer(hand_response(request, status, version), time.monotonic() + self.faults.slow_reply)
+
+
+def _put(hand: HandServer, words: list[str]) -> None:
+    if hand.world is not None:
+        raise ValueError("the fingers meet the objects of the simulated world: use rig.world")
+    hand.fingers.put(None if words[0] == "none" else read_number(words[0], 1e-6, FULL_WIDTH))
+
+
+_seconds = between(0.0, 1e6)
+
+HAND_COMMANDS = make_commands(
+    Command("object W|none", "put an object of W m between the fingers, or remove it", _put),
+    Command(
+        "grasp-ends-at-width on|off",
+        "a grasp that meets nothing ends at its width, or closes all the way (the default)",
+        assign("fingers.grasp_ends_at_width", read_switch),
+    ),
+    Command(
+        "unhome",
+        "undo the homing, as after switching on",
+        lambda hand, _: setattr(hand.fingers, "homed", False),
+    ),
+    Command(
+        "stop-ignored on|off",
+        "Stop is answered, but has no effect (libfranka, issue 18)",
+        assign("faults.stop_ignored", read_switch),
+    ),
+    Command(
+        "stop-releases on|off",
+        "Stop ends the pressing force (libfranka, issue 111)",
+        assign("faults.stop_releases", read_switch),
+    ),
+    Command(
+        "silence S",
+        "send no states for S seconds",
+        assign("faults.silent_until", lambda word: time.monotonic() + _seconds(word)),
+    ),
+    Command("slow-reply S", "answer everything S seconds later (0: at once)", assign("faults.slow_reply", _seconds)),
+    Command(
+        "fail [N]",
+        "fail the next N motions at once (1)",
+        lambda hand, words: setattr(hand.faults, "failures", int(read_number((words or ["1"])[0], 0, 1e6))),
+    ),
+    Command("version N", "claim to speak this protocol", assign("faults.version", whole(0, 65535))),
+    Command("temperature T", "report T degrees Celsius", assign("faults.temperature", whole(0, 65535))),
+    Command("drop", "close the connection", lambda hand, _: hand.network.disconnect()),
+    Command(
+        "restart [S]",
+        "switch off, and on again S seconds later (0.5)",
+        lambda hand, words: hand.restart(_seconds((words or ["0.5"])[0])),
+    ),
+    Command("state", "present state of the hand", lambda _, __: None),
+)
 
 
 def _motion(request: HandRequest) -> FingerMotion:

@@ -8,10 +8,10 @@ import sys
 from collections.abc import Sequence
 
 from hal.config.loader import load
-from hal_emulators.control import Started, run_emulator
+from hal_emulators.control import Started, help_text, run_emulator
 from hal_emulators.shared_world import enter_world, has_world
 
-from .server import RobotiqEmulator, find_grippers, help_text
+from .server import COMMANDS, RobotiqEmulator, find_grippers
 
 _WHAT = (
     "Emulates every Robotiq gripper of a rig, on a pseudo terminal with the name of its port, or on the text port of "
@@ -21,7 +21,7 @@ _WHAT = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
-    return run_emulator("robotiq", _WHAT, help_text(), arguments, _start)
+    return run_emulator("robotiq", _WHAT, help_text(COMMANDS), arguments, _start)
 
 
 def _start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Started:

@@ -6,24 +6,20 @@ with RobotiqEmulator("fr3_robotiq") as emulator:
 
 from __future__ import annotations
 
-import os
 import select
-import signal
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 
 from hal.config.loader import load
 from hal.specs import GripperSpec
-from hal_emulators.control import read_end, read_switch
+from hal_emulators.control import Command, assign, make_commands, read_end, read_switch, run_command
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .gripper import EmulatedGripper
 from .ports import Port, SerialPort, TextPort
-
-__all__ = ["COMMANDS", "RobotiqEmulator", "find_grippers", "help_text"]
 
 _STEP = 0.002
 """Longest step of the fingers, s."""
@@ -110,14 +106,8 @@ class RobotiqEmulator:
         """
         words = line.split()
         port = self.ports[words.pop(0)] if words and words[0] in self.ports else next(iter(self.ports.values()))
-        command = COMMANDS.get(words[0] if words else "")
-        if command is None:
-            raise ValueError(f"there is no command {' '.join(words[:1])!r}; help lists them")
-        try:
-            with self.lock:
-                return command.run(port, words[1:]) or {}
-        except (ValueError, IndexError) as error:
-            raise ValueError(f"{error}; usage: {command.usage}") from None
+        with self.lock:
+            return run_command(COMMANDS, port, words)
 
     def start(self) -> None:
         """Offer all lines. Raises OSError."""
@@ -142,16 +132,6 @@ class RobotiqEmulator:
 
 
 # Commands.
-
-
-class _Command(NamedTuple):
-    usage: str
-    meaning: str
-    run: Callable[[Port, list[str]], dict[str, Any] | None]
-
-
-def _set(name: str, read: Callable[[str], Any]) -> Callable[[Port, list[str]], None]:
-    return lambda port, words: setattr(port, name, read(words[0]))
 
 
 def _put(port: Port, words: list[str]) -> None:
@@ -184,34 +164,16 @@ def _reset(port: Port, _: list[str]) -> None:
     port.gripper.blocked = False
 
 
-COMMANDS = {
-    "object": _Command(
-        "object M|none",
-        "put an object of this width between the fingers",
-        _put,
-    ),
-    "fault": _Command(
-        "fault CODE", "raise a fault, hex: 8 to F; 0 ends it", lambda p, w: p.gripper.fail(int(w[0], 16))
-    ),
-    "block": _Command(
-        "block on|off",
-        "hold the fingers, so that an activation fails",
-        lambda port, words: setattr(port.gripper, "blocked", read_switch(words[0])),
-    ),
-    "power": _Command("power [S|on|off]", "switch its power off for 0.5 s, for S, for good, or on again", _power),
-    "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", read_end)),
-    "silent": _Command("silent S|on|off", "neither hear nor answer", _set("silent_until", read_end)),
-    "late": _Command("late S", "send answers S seconds late", _set("delay", float)),
-    "lose": _Command("lose P | next N", "lose that share of the answers, or exactly the next N", _lose),
-    "garble": _Command("garble N", "spoil the check of the next N answers", _set("garble_next", int)),
-    "state": _Command("state", "registers, width (m), force (N)", _state),
-    "reset": _Command("reset", "end all faults of the line, and `block`", _reset),
-    "kill": _Command("kill", "end this program at once", lambda _, __: os.kill(os.getpid(), signal.SIGKILL)),
-    "help": _Command("help", "this table", lambda _, __: {"text": help_text()}),
-}
-
-
-def help_text() -> str:
-    """Return the table of commands."""
-    width = max(len(command.usage) for command in COMMANDS.values())
-    return "\n".join(f"  {command.usage:{width}}  {command.meaning}" for command in COMMANDS.values())
+COMMANDS = make_commands(
+    Command("object M|none", "put an object of this width between the fingers", _put),
+    Command("fault CODE", "raise a fault, hex: 8 to F; 0 ends it", lambda p, w: p.gripper.fail(int(w[0], 16))),
+    Command("block on|off", "hold the fingers, so that an activation fails", assign("gripper.blocked", read_switch)),
+    Command("power [S|on|off]", "switch its power off for 0.5 s, for S, for good, or on again", _power),
+    Command("unplug S|on|off", "take the line away", assign("out_until", read_end)),
+    Command("silent S|on|off", "neither hear nor answer", assign("silent_until", read_end)),
+    Command("late S", "send answers S seconds late", assign("delay", float)),
+    Command("lose P | next N", "lose that share of the answers, or exactly the next N", _lose),
+    Command("garble N", "spoil the check of the next N answers", assign("garble_next", int)),
+    Command("state", "registers, width (m), force (N)", _state),
+    Command("reset", "end all faults of the line, and `block`", _reset),
+)

@@ -6,7 +6,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from hal_emulators.network_arm import help_text, run_program
+from hal_emulators.control import help_text, make_parser
+from hal_emulators.network_arm import run_program
 
 from .controller import Controller
 from .motion import ROBOTS
@@ -17,13 +18,8 @@ HOME = (0.0, -1.669, 1.659, -1.56, -1.571, 0.0)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="hal emulate ur",
-        description="Emulates the controller of a Universal Robots arm for ur_rtde. What UR does not publish is "
-        "assumed; it proves nothing about a real arm.",
-        epilog="commands, typed here or sent to the control port:\n" + help_text(COMMANDS),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    what = "Emulates the controller of a Universal Robots arm for ur_rtde."
+    parser = make_parser("ur", what, help_text(COMMANDS))
     add = parser.add_argument
     add("--robot", choices=sorted(ROBOTS), default="ur5e", help="which arm; ur3, ur5, ur10 are CB3 (%(default)s)")
     add("--q", type=float, nargs=6, default=HOME, metavar="RAD", help="joint positions at the start")

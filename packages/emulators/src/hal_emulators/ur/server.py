@@ -7,8 +7,8 @@ import struct
 from typing import Any, ClassVar
 
 from hal_emulators import network_arm
-from hal_emulators.control import read_number, read_switch
-from hal_emulators.network_arm import Act, Client, NetworkArm, take_lines
+from hal_emulators.control import Command, Run, assign, between, make_commands, read_number, read_switch
+from hal_emulators.network_arm import Client, NetworkArm, take_lines
 
 from .controller import POWER_OFF, RUNNING, Controller
 
@@ -24,23 +24,53 @@ _VECTORS = re.compile(
 _UNSIGNED = re.compile("(robot|safety)_status_bits|runtime_state|output_bit_registers.*|speed_slider_mask")
 _UNSET = {"6d": (0.0,) * 6, "3d": (0.0,) * 3, "6i": (0,) * 6}
 
-COMMANDS = {
-    "protective": ("", "protective stop"),
-    "estop": ("on|off", "press or release the emergency stop; then: power"),
-    "safeguard": ("on|off", "interrupt or close the safeguard input"),
-    "safety": ("MODE", "mode of the safety system: 1 normal, 4 recovery, 6 stop of the system, 8 violation, 9 fault"),
-    "jump": ("RAD", "take the next set-point so far away"),
-    "power": ("on|off", "switch the arm on and release its brakes, or off"),
-    "remote": ("on|off", "remote or local control"),
-    "slider": ("SHARE", "the speed slider, 0 to 1"),
-    "limit": ("SHARE", "scale the speed, 0.01 to 1, as near a safety limit"),
-    "stuck": ("on|off", "ignore set-points"),
-    "jog": ("JOINT RAD", "move a joint (0 to 5) by hand, while no program runs"),
-    "push": ("FX FY FZ", "push the arm, N in the controller's base"),
-    "pause": ("on|off", "pause the program, or let it go on"),
-    "program": ("[NAME]", "run another program, or stop the one that is running"),
-    **network_arm.COMMANDS,
-}
+
+def _push(arm: UrServer, words: list[str]) -> None:
+    arm.controller.push([read_number(words[k], -1e3, 1e3) for k in range(3)])
+
+
+def _jog(arm: UrServer, words: list[str]) -> None:
+    arm.controller.jog(int(read_number(words[0], 0, 5)), read_number(words[1], -3.0, 3.0))
+
+
+def _program(arm: UrServer, words: list[str]) -> None:
+    if words:
+        arm.controller.upload(f"def {words[0]}():")
+    else:
+        arm.controller.stop_program("pendant")
+
+
+def _switch(method: str) -> Run:
+    return lambda arm, words: getattr(arm.controller, method)(read_switch(words[0]))
+
+
+COMMANDS = make_commands(
+    Command("protective", "protective stop", lambda arm, _: arm.controller.stop_protective("C153: requested here")),
+    Command("estop on|off", "press or release the emergency stop; then: power", _switch("stop_emergency")),
+    Command("safeguard on|off", "interrupt or close the safeguard input", _switch("set_safeguard")),
+    Command(
+        "safety MODE",
+        "mode of the safety system: 1 normal, 4 recovery, 6 stop of the system, 8 violation, 9 fault",
+        lambda arm, words: arm.controller.set_safety(int(read_number(words[0], 1, 9))),
+    ),
+    Command("jump RAD", "take the next set-point so far away", assign("controller.jump", between(-3.0, 3.0))),
+    Command(
+        "power on|off",
+        "switch the arm on and release its brakes, or off",
+        lambda arm, words: arm.controller.set_power(RUNNING if read_switch(words[0]) else POWER_OFF),
+    ),
+    Command("remote on|off", "remote or local control", _switch("set_remote")),
+    Command("slider SHARE", "the speed slider, 0 to 1", assign("controller.motion.scale", between(0.01, 1.0))),
+    Command(
+        "limit SHARE", "scale the speed, as near a safety limit", assign("controller.motion.limit", between(0.01, 1.0))
+    ),
+    Command("stuck on|off", "ignore set-points", assign("controller.stuck", read_switch)),
+    Command("jog JOINT RAD", "move a joint (0 to 5) by hand, while no program runs", _jog),
+    Command("push FX FY FZ", "push the arm, N in the controller's base", _push),
+    Command("pause on|off", "pause the program, or let it go on", _switch("pause")),
+    Command("program [NAME]", "run another program, or stop the one that is running", _program),
+    *network_arm.COMMANDS,
+)
 
 
 def _type_of(name: str) -> str:
@@ -181,25 +211,6 @@ class UrServer(NetworkArm):
                 state = state or self.controller.read_state()
                 data = b"\1" + client.output.pack(state)
                 self.send_state(client, struct.pack(">HB", 3 + len(data), ord("U")) + data)
-
-    def acts(self) -> dict[str, Act]:
-        c, motion = self.controller, self.controller.motion
-        return {
-            "protective": lambda _: c.stop_protective("C153: requested here"),
-            "estop": lambda words: c.stop_emergency(read_switch(words[0])),
-            "safeguard": lambda words: c.set_safeguard(read_switch(words[0])),
-            "safety": lambda words: c.set_safety(int(read_number(words[0], 1, 9))),
-            "jump": lambda words: setattr(c, "jump", read_number(words[0], -3.0, 3.0)),
-            "power": lambda words: c.set_power(RUNNING if read_switch(words[0]) else POWER_OFF),
-            "remote": lambda words: c.set_remote(read_switch(words[0])),
-            "slider": lambda words: setattr(motion, "scale", read_number(words[0], 0.01, 1.0)),
-            "limit": lambda words: setattr(motion, "limit", read_number(words[0], 0.01, 1.0)),
-            "stuck": lambda words: setattr(c, "stuck", read_switch(words[0])),
-            "jog": lambda words: c.jog(int(read_number(words[0], 0, 5)), read_number(words[1], -3.0, 3.0)),
-            "push": lambda words: c.push([read_number(words[k], -1e3, 1e3) for k in range(3)]),
-            "pause": lambda words: c.pause(read_switch(words[0])),
-            "program": lambda words: c.upload(f"def {words[0]}():") if words else c.stop_program("pendant"),
-        }
 
     def renew(self) -> Controller:
         old = self.controller

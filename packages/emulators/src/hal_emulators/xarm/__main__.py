@@ -6,7 +6,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from hal_emulators.network_arm import help_text, run_program
+from hal_emulators.control import help_text, make_parser
+from hal_emulators.network_arm import run_program
 
 from .controller import ROBOTS, Controller
 from .server import COMMANDS, ORDERS, XArmServer
@@ -21,13 +22,8 @@ HOMES = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="hal emulate xarm",
-        description="Emulates the control box of a UFACTORY arm for xarm-python-sdk. What UFACTORY does not publish is "
-        "assumed; it proves nothing about a real arm.",
-        epilog="commands, typed here or sent to the control port:\n" + help_text(COMMANDS),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    what = "Emulates the control box of a UFACTORY arm for xarm-python-sdk."
+    parser = make_parser("xarm", what, help_text(COMMANDS))
     parser.add_argument("--robot", choices=sorted(ROBOTS), default="xarm7", help="which arm (%(default)s)")
     parser.add_argument("--q", type=float, nargs="+", metavar="RAD", help="joint positions at the start")
     ports = f"commands {ORDERS}, reports 30001 to 30003"

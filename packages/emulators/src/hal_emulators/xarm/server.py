@@ -11,12 +11,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 from hal_emulators import network_arm
-from hal_emulators.control import read_number, read_switch
-from hal_emulators.network_arm import Act, Client, NetworkArm
+from hal_emulators.control import Command, Run, assign, between, make_commands, read_number, read_switch, whole
+from hal_emulators.network_arm import Client, NetworkArm
 from hal_emulators.shared_world import ArmInWorld
 
 from .controller import DT, Controller
-from .gripper import Gripper
 
 __all__ = ["COMMANDS", "ORDERS", "XArmServer"]
 
@@ -28,21 +27,53 @@ VERSION = "v2.5.0"
 FORCE = 30.0
 """Of the gripper, N."""
 
-COMMANDS = {
-    "error": ("NUMBER", "stop with an error of the controller, as 31 (collision)"),
-    "warn": ("NUMBER", "a warning; 0 for none"),
-    "jump": ("RAD", "take the next set-point so far away"),
-    "estop": ("on|off", "press or release the emergency stop"),
-    "state": ("NUMBER", "as another program: 3 pauses, 4 stops"),
-    "mode": ("NUMBER", "as another program: take over in this mode, as 0 (position) or 2 (by hand)"),
-    "power": ("on|off", "switch the motors on or off"),
-    "jog": ("JOINT RAD", "move a joint (0 to 6) by hand"),
-    "object": ("M|none", "put an object of this width between the gripper's fingers"),
-    "gripper": ("NUMBER|on|off|block", "an error of the gripper, 0 for none; unplug it; hold its fingers"),
-    "block": ("on|off", "hold the joints, as an obstacle would"),
-    "nan": ("on|off", "report a joint as not a number"),
-    **network_arm.COMMANDS,
-}
+
+def _call(method: str, read: Callable[[str], object]) -> Run:
+    return lambda arm, words: getattr(arm.controller, method)(read(words[0]))
+
+
+def _jog(arm: XArmServer, words: list[str]) -> None:
+    c = arm.controller
+    c.jog(int(read_number(words[0], 0, c.axes - 1)), read_number(words[1], -3.0, 3.0))
+
+
+def _disturb(arm: XArmServer, words: list[str]) -> None:
+    gripper, word = arm.controller.gripper, words[0]
+    if word == "block":
+        gripper.blocked = True
+    elif word in ("on", "off"):
+        gripper.connected, gripper.blocked = word == "on", False
+    else:
+        gripper.fail(int(read_number(word, 0, 255)))
+
+
+COMMANDS = make_commands(
+    Command(
+        "error NUMBER", "stop with an error of the controller, as 31 (collision)", _call("raise_error", whole(1, 255))
+    ),
+    Command("warn NUMBER", "a warning; 0 for none", assign("controller.warning", whole(0, 255))),
+    Command("jump RAD", "take the next set-point so far away", assign("controller.jump", between(-3.0, 3.0))),
+    Command("estop on|off", "press or release the emergency stop", _call("press", read_switch)),
+    Command("state NUMBER", "as another program: 3 pauses, 4 stops", _call("set_state", whole(0, 6))),
+    Command(
+        "mode NUMBER",
+        "as another program: take over in this mode, as 0 (position) or 2 (by hand)",
+        _call("take_over", whole(0, 11)),
+    ),
+    Command("power on|off", "switch the motors on or off", _call("enable", read_switch)),
+    Command("jog JOINT RAD", "move a joint (0 to 6) by hand", _jog),
+    Command(
+        "object M|none",
+        "put an object of this width between the gripper's fingers",
+        assign("controller.gripper.object_width", lambda word: None if word == "none" else float(word)),
+    ),
+    Command(
+        "gripper NUMBER|on|off|block", "an error of the gripper, 0 for none; unplug it; hold its fingers", _disturb
+    ),
+    Command("block on|off", "hold the joints, as an obstacle would", assign("controller.blocked", read_switch)),
+    Command("nan on|off", "report a joint as not a number", assign("controller.blind", read_switch)),
+    *network_arm.COMMANDS,
+)
 
 
 class XArmServer(NetworkArm):
@@ -141,34 +172,6 @@ class XArmServer(NetworkArm):
             body += bytes([c.arm.kind, c.axes, 0, 0, 0, 0]) + VERSION.encode().ljust(30, b"\0")
             body += struct.pack("<12f", 1e3, 1.0, 5e4, 0.1, 1e3, 20.0, 0.01, 20.0, 1e-4, math.pi, 2.3, 2.7) + bytes(16)
         return struct.pack(">I", 4 + len(body)) + body
-
-    # Faults.
-
-    def acts(self) -> dict[str, Act]:
-        c = self.controller
-        return {
-            "error": lambda words: c.raise_error(int(read_number(words[0], 1, 255))),
-            "warn": lambda words: setattr(c, "warning", int(read_number(words[0], 0, 255))),
-            "jump": lambda words: setattr(c, "jump", read_number(words[0], -3.0, 3.0)),
-            "estop": lambda words: c.press(read_switch(words[0])),
-            "state": lambda words: c.set_state(int(read_number(words[0], 0, 6))),
-            "mode": lambda words: c.take_over(int(read_number(words[0], 0, 11))),
-            "power": lambda words: c.enable(read_switch(words[0])),
-            "jog": lambda words: c.jog(int(read_number(words[0], 0, c.axes - 1)), read_number(words[1], -3.0, 3.0)),
-            "object": lambda words: setattr(c.gripper, "object_width", None if words[0] == "none" else float(words[0])),
-            "gripper": lambda words: self._disturb(c.gripper, words[0]),
-            "block": lambda words: setattr(c, "blocked", read_switch(words[0])),
-            "nan": lambda words: setattr(c, "blind", read_switch(words[0])),
-        }
-
-    @staticmethod
-    def _disturb(gripper: Gripper, word: str) -> None:
-        if word == "block":
-            gripper.blocked = True
-        elif word in ("on", "off"):
-            gripper.connected, gripper.blocked = word == "on", False
-        else:
-            gripper.fail(int(read_number(word, 0, 255)))
 
     def exchange(self, world: ArmInWorld) -> None:
         gripper = self.controller.gripper
