@@ -24,7 +24,7 @@ GONE = 2.0
 """A computer that has sent nothing for so long is gone, s. Its arms stopped long before."""
 DRIFT = 1e-3
 """Greatest difference between the rates of two monotonic clocks, each of which a time server may slew by 500 ppm."""
-MOST_ROUND_TRIP = 0.1
+MOST_ROUND_TRIP = 0.15
 """Longest round trip with which a control session may be opened, s."""
 ANSWER_LIMIT = 5.0
 """Longest wait for the first answer of the other end, s."""
@@ -38,6 +38,8 @@ _LARGEST = 4 << 20
 """Size of the largest frame, bytes: a long path in a request."""
 _BUFFERED = 1 << 16
 """Bytes that the system may hold for a connection: more would only get old there."""
+_UNSENT = 1024
+"""Of these, bytes that may wait to be sent the first time: while a slow link holds frames back, none gets old here."""
 _HEADER = struct.Struct("<IQddd")
 """Length of the rest, number, time of sending; when the other end's newest frame was sent, and when it came."""
 _COUNT = struct.Struct("<H")
@@ -142,6 +144,7 @@ class RigLink:
         self._sock = sock
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFERED)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
         sock.setblocking(False)
         self._period = period
         self._messages: deque[Any] = deque()

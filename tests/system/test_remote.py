@@ -168,7 +168,7 @@ def test_a_pad_of_a_third_computer_holds_the_dead_man_and_a_new_press_is_needed_
             assert pad.rumbles, "the stop was felt"
             leader.move([0.1] * 5)
             wait_until(lambda: rig.gamepads["left"].state().joints == (0.1,) * 5, "the leader's joints arrive")
-            proxy.delay = 0.06
+            proxy.delay = 0.09
             proxy.cut()
             wait_until(lambda: any("round trip" in note for note in found.notes), "a link that is too slow")
             assert not found.state().connected
@@ -296,7 +296,7 @@ def test_frames_lost_repeated_or_out_of_order_and_a_wall_clock_that_steps_change
 
 
 def test_a_link_with_a_long_round_trip_opens_no_session(bench: Bench) -> None:
-    bench.proxy.delay = 0.06
+    bench.proxy.delay = 0.09
     with hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig:
         assert rig.robots["panda"].state(1.0).status is RobotStatus.IDLE
         with raises_code(ConnectionLost, "link_too_slow"), rig.robots["panda"].control():
