@@ -42,8 +42,8 @@ def run_apart(server: Sequence[str], client: Sequence[str], **network: float) ->
     Args:
         server: Command; it listens at :data:`SERVER`.
         client: Command; its last line of output is JSON, which is returned.
-        **network: Either ``delay`` (one way, s), ``jitter`` (s, each way at most) and ``loss`` (share of the packets),
-            or ``rate`` (bit/s).
+        **network: Either ``delay`` (one way, s), ``jitter`` (s, each way at most), ``loss`` (share of the packets) and
+            ``reorder`` (1: packets may overtake each other; 0: they queue), or ``rate`` (bit/s).
     """
     words = json.dumps([list(server), list(client), network])
     done = subprocess.run(
@@ -79,7 +79,7 @@ def _enter(server: Sequence[str], client: Sequence[str], network: dict[str, floa
             other.kill()
 
 
-def _connect(other: int, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, rate: float = 0.0) -> None:
+def _connect(other: int, rate: float = 0.0, **network: float) -> None:
     """Put an end of the network into this namespace and one into that of a process."""
     if rate:
         subprocess.run(f"ip link add net0 type veth peer name net0 netns {other}".split(), check=True)
@@ -92,19 +92,22 @@ def _connect(other: int, delay: float = 0.0, jitter: float = 0.0, loss: float = 
         ends.append(os.open("/dev/net/tun", os.O_RDWR))
         fcntl.ioctl(ends[-1], _SET_DEVICE, struct.pack("16sH22x", b"net0", _TUN | _NO_HEADER))
     assert libc.setns(here, _NEW_NETWORK) == 0
-    threading.Thread(target=_forward, args=(*ends, delay, jitter, loss), daemon=True).start()
+    threading.Thread(target=_forward, args=ends, kwargs=network, daemon=True).start()
 
 
-def _forward(one: int, other: int, delay: float, jitter: float, loss: float) -> None:
+def _forward(
+    one: int, other: int, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, reorder: float = 0.0
+) -> None:
     """Pass packets on, late, out of order, or not at all."""
     chance, waiting = random.Random(1), list[tuple[float, int, int, bytes]]()
-    to, number = {one: other, other: one}, 0
+    to, number, newest = {one: other, other: one}, 0, {one: 0.0, other: 0.0}
     while True:
         rest = max(0.0, waiting[0][0] - time.monotonic()) if waiting else None
         for end in select.select([one, other], [], [], rest)[0]:
             packet, number = os.read(end, 1 << 16), number + 1
             if chance.random() >= loss:
                 due = time.monotonic() + delay + jitter * chance.uniform(-1.0, 1.0)
+                newest[end] = due = due if reorder else max(due, newest[end])
                 heapq.heappush(waiting, (due, number, to[end], packet))
         while waiting and waiting[0][0] <= time.monotonic():
             _, _, end, packet = heapq.heappop(waiting)

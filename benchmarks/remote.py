@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import random
@@ -9,13 +10,17 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import hal
 from hal.keys import make_key
+from hal.types import Trip
 
 from ._network import SERVER, run_apart
 from .kit import ROOT, Table, compare, ms
@@ -45,9 +50,9 @@ def serve(address: str) -> Iterator[tuple[str, int]]:
             server.terminate()
 
 
-def measure_delays(rig: hal.Rig, count: int) -> list[float]:
-    """Return the times from sending a command until its set-point is written, s."""
-    found, chance = [], random.Random(1)
+def measure_delays(rig: hal.Rig, count: int) -> dict[str, Any]:
+    """Return the times from sending a command until its set-point is written, ms, and how often the arm was stopped."""
+    found, stops, chance = list[float](), 0, random.Random(1)
     arm: Any = rig.robots["panda"]
     with arm.control(rate_hz=10) as control:
         control.send(TURN)
@@ -57,12 +62,30 @@ def measure_delays(rig: hal.Rig, count: int) -> list[float]:
             control.send(TURN)
             number = arm._commands
             while (servo := arm._mail.peek()).target_seq < number:
+                if control.trip is not Trip.NONE:
+                    stops += restart(control, TURN)
+                    break
                 if time.monotonic() > sent + LOST:
                     raise TimeoutError("a command did not arrive")
                 time.sleep(0.0001)
-            found.append(servo.t_written - sent)
+            else:
+                found.append(servo.t_written - sent)
             time.sleep(chance.uniform(0.003, 0.006))
-    return found
+    return {"median, 99 % (ms)": ms(found, 0.5, 0.99), "stops": stops}
+
+
+def restart(control: hal.Control, command: hal.Command) -> int:
+    """Acknowledge a stop, and wait until a command is taken; return 1."""
+    control.rearm()
+    end = time.monotonic() + LOST
+    while True:
+        try:
+            control.send(command)
+            return 1
+        except hal.MotionStopped:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.01)
 
 
 def measure_load(rig: hal.Rig, pids: tuple[int, int], seconds: float) -> list[float]:
@@ -99,8 +122,7 @@ with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overr
 def find_delays(count: int) -> dict[str, Any]:
     """Return the delays of commands to the server of the other namespace."""
     with hal.open({"robots": {"panda": {"at": SERVER}}}, pad="none") as rig:
-        found = {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
-        return found | {"round trip (ms)": 1e3 * rig.statistics()[SERVER]["link"]["round_trip_s"]}
+        return measure_delays(rig, count) | {"round trip (ms)": 1e3 * rig.statistics()[SERVER]["link"]["round_trip_s"]}
 
 
 def find_ages(seconds: float, cameras: tuple[str, ...]) -> dict[str, Any]:
@@ -121,6 +143,81 @@ def find_ages(seconds: float, cameras: tuple[str, ...]) -> dict[str, Any]:
         return found
 
 
+SERVE_WATCHED = """
+import hal, threading
+from benchmarks import remote
+from hal.remote.server import Server
+changes = {{"cameras": {{}}, "objects": []}}
+with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=changes) as rig:
+    threading.Thread(target=Server(rig, "{server}", 7447, print).run, daemon=True).start()
+    print("listening", flush=True)
+    remote.watch_limits(rig.robots["panda"], {file!r})
+"""
+BAD = {"delay": 0.05, "jitter": 0.05, "loss": 0.05, "reorder": 1.0}
+"""Of each packet, each way; TCP turns loss and reordering into stalls of up to some 100 ms."""
+
+
+def watch_limits(arm: hal.Robot, file: str) -> None:
+    """Compare the set-points of an arm with its limits until the process is ended; write what was found to a file."""
+    period, limits = 1.0 / arm.spec.rate_hz, arm.limits
+    lower, upper, fastest, most = map(np.array, (limits.lower, limits.upper, limits.velocity, limits.acceleration))
+    last, points, outside, way, due = arm.state(LOST), 0, 0, 0.0, 0.0
+    while True:
+        time.sleep(0.2 * period)
+        state = arm.state(LOST)
+        if state.stamp.seq == last.stamp.seq:
+            continue
+        changes = np.abs(state.dq_set - last.dq_set) / (period * (state.stamp.seq - last.stamp.seq))
+        beyond = np.concatenate(
+            (lower - state.q_set, state.q_set - upper, np.abs(state.dq_set) - fastest, changes - most)
+        )
+        way += float(np.abs(state.q_set - last.q_set).sum())
+        last, points, outside = state, points + 1, outside + int(not (beyond < 1e-6).all())  # NaN is beyond, too
+        if time.monotonic() > due:
+            due = time.monotonic() + 0.5
+            Path(file).write_text(json.dumps([points, outside, way]))
+
+
+def find_trips(seconds: float, file: str) -> dict[str, Any]:
+    """Drive an arm at random, into its limits as well, whatever stops it; return what was found, and the stops."""
+    stops, end = Counter[str](), time.monotonic() + seconds
+    while time.monotonic() < end:
+        try:
+            rig_file = {"robots": {"panda": {"at": SERVER}}}
+            with hal.open(rig_file, pad="none") as rig, rig.robots["panda"].control(rate_hz=10) as control:
+                _drive_at_random(rig, control, end, stops)
+        except hal.HalError as error:  # the link was lost, or is too slow for a session
+            stops[error.code or type(error).__name__] += 1
+            time.sleep(0.5)
+    points, outside, way = json.loads(Path(file).read_text())
+    found = {"set-points": points, "outside of a limit": outside, "way of all joints (rad)": way}
+    return found | {f"stops ({name})": count for name, count in stops.items()}
+
+
+def _drive_at_random(rig: hal.Rig, control: hal.Control, end: float, stops: Counter[str]) -> None:
+    chance, command, due = random.Random(1), TURN, 0.0
+    for tick in rig.clock.rate(100):
+        if time.monotonic() > end:
+            return
+        if tick.elapsed >= due:
+            due += 0.5
+            command = hal.JointVelocity([chance.uniform(-1.0, 1.0) for _ in range(7)])
+        try:
+            control.send(command)
+        except hal.MotionStopped as stop:
+            stops[stop.code or ""] += restart(control, TURN)
+
+
+def soak(seconds: float) -> Table:
+    """Return what became of an arm that was driven over a bad link for some time."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = f"{folder}/found.json"
+        found = apart(
+            [sys.executable, "-c", SERVE_WATCHED.format(server=SERVER, file=file)], find_trips, seconds, file, **BAD
+        )
+    return compare(f"{seconds:g} s over a link with 5 % loss and 0 to 100 ms of delay each way", {"": found})
+
+
 def apart(
     serve: Sequence[str], find: Callable[..., dict[str, Any]], *arguments: Any, **network: float
 ) -> dict[str, Any]:
@@ -137,8 +234,10 @@ def networks() -> Iterator[Table]:
     count, seconds = 300, 10.0
     yield compare(
         "The same over a network with this round trip",
-        {f"{trip:g} ms": apart(arm, find_delays, count, delay=0.5e-3 * trip) for trip in (0.3, 20.0)},
+        {f"{trip:g} ms": apart(arm, find_delays, count, delay=0.5e-3 * trip) for trip in (0.3, 20.0)}
+        | {"100 ms, each way 10 ms more or less": apart(arm, find_delays, count, delay=0.05, jitter=0.01)},
     )
+    yield soak(seconds)
     both = [sys.executable, "-c", SERVE_CAMERAS]
     yield compare(
         "A mock arm and two RGB-D cameras, 640x480 at 30 Hz, over 1 Gbit/s",
@@ -153,16 +252,14 @@ def local(quick: bool) -> Iterator[Table]:
     """Yield the table over loopback."""
     count, seconds = (20, 0.5) if quick else (2000, 5.0)
     with hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=CHANGES) as rig:
-        results: dict[str, dict[str, Any]] = {
-            "one computer": {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
-        }
+        results: dict[str, dict[str, Any]] = {"one computer": measure_delays(rig, count)}
     with tempfile.TemporaryDirectory() as keys:
         os.environ["HAL_KEYS"] = keys
         make_key("host", "here", [WITH_TLS])
         make_key("person", "me")
         for name, address in (("over a link", "127.0.0.1"), ("with TLS", WITH_TLS)):
             with serve(address) as (at, pid), hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
-                found: dict[str, Any] = {"median, 99 % (ms)": ms(measure_delays(rig, count), 0.5, 0.99)}
+                found = measure_delays(rig, count)
                 found["round trip (ms)"] = 1e3 * rig.statistics()[at]["link"]["round_trip_s"]
                 host: Any = rig._hosts[0]
                 shares = measure_load(rig, (host.child.process.pid, pid), seconds)
@@ -178,3 +275,7 @@ def run(quick: bool = False) -> Iterator[Table]:
     yield from local(quick)
     if not quick:
         yield from networks()
+
+
+if __name__ == "__main__":  # python -m benchmarks.remote SECONDS: the bad link alone, for so long
+    print(soak(float(sys.argv[1])))
