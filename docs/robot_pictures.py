@@ -99,7 +99,8 @@ def sheet(folders: list[Path]) -> Image.Image:
     for place, name in enumerate(names):
         for row, folder in enumerate(folders, place // COLUMNS * len(folders)):
             corner = SMALL * (place % COLUMNS), (SMALL + LABEL) * row
-            draw_on.text((corner[0] + 2, corner[1]), f"{name}, {folder.name}", fill="black")
+            label = f"{name}, {folder.name}" if len(folders) > 1 else name
+            draw_on.text((corner[0] + 2, corner[1]), label, fill="black")
             if (path := folder / f"{name}.png").is_file():
                 small = Image.open(path).convert("RGB").resize((SMALL, SMALL), Image.Resampling.LANCZOS)
                 whole.paste(small, (corner[0], corner[1] + LABEL))
