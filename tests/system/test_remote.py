@@ -26,7 +26,7 @@ from hal.apps import collect, replay
 from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
 from hal.lock import APP_MARK
-from hal.recording import Dataset
+from hal.recording import Dataset, Recorder
 from hal.remote.client import connect
 from hal.servo.watchdog import SILENCE
 from hal.types import RobotStatus, Trip
@@ -301,6 +301,32 @@ def test_a_link_with_a_long_round_trip_opens_no_session(bench: Bench) -> None:
         assert rig.robots["panda"].state(1.0).status is RobotStatus.IDLE
         with raises_code(ConnectionLost, "link_too_slow"), rig.robots["panda"].control():
             pass
+
+
+@pytest.mark.alone
+def test_recordings_at_the_arm_and_at_the_program_agree_within_1_ms(bench: Bench, tmp_path: Path) -> None:
+    bench.proxy.delay = 0.005
+    with (
+        hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig,
+        Recorder(rig, tmp_path / "program", fps=30) as here,
+        Recorder(bench.rig, tmp_path / "arm", fps=60) as there,
+        rig.robots["panda"].control(rate_hz=5) as control,
+    ):
+        there.start()
+        here.start()
+        for tick in rig.clock.rate(50):
+            control.send(hal.JointVelocity([0.3, 0, 0, 0, 0, 0, 0]))
+            if tick.elapsed > 1.5:
+                break
+        here.save(True, wait=True)
+        there.save(True, wait=True)
+    (own,), (theirs,) = Dataset(tmp_path / "program").episodes, Dataset(tmp_path / "arm").episodes
+    t, their_t = own.stamps["robot.panda"], theirs.stamps["robot.panda"]
+    q, their_q = (episode.columns["observation.state"][:, 0] for episode in (own, theirs))
+    cruise = (t > t[0] + 0.7) & (t < their_t[-1])
+    assert cruise.sum() > 5
+    assert q[cruise][-1] - q[cruise][0] > 0.1, "the arm moved"
+    assert np.abs(q - np.interp(t, their_t, their_q))[cruise].max() <= 0.3 * 0.001
 
 
 def test_who_may_connect_and_ask_for_what(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
