@@ -63,7 +63,6 @@ class CanBus:
     _lock = threading.Lock()
 
     def __init__(self, settings: BusSettings) -> None:
-        """Prepare a bus that is not open. Use :meth:`acquire`."""
         self.settings = settings
         self.fault: Fault | None = None
         self._users = 0
@@ -120,14 +119,9 @@ class CanBus:
             self._disconnect()
 
     def subscribe(self, handlers: dict[int, FrameHandler], sent: Iterable[int]) -> None:
-        """Hand frames with these ids to a device.
+        """Hand frames with these ids to functions that must not raise; ``sent`` are the ids that the device sends.
 
-        Args:
-            handlers: Id -> function that takes the data of such a frame. It must not raise.
-            sent: Ids that the device sends.
-
-        Raises:
-            ConfigError: Another device of this process has one of the ids.
+        Raises ConfigError if another device of this process has one of the ids.
         """
         sent = tuple(sent)
         taken = sorted({id for id in handlers if id in self._handlers} | {id for id in sent if self._handlers.get(id)})
@@ -322,7 +316,6 @@ class CanBus:
     # Statistics.
 
     def reset_statistics(self) -> None:
-        """Start the figures again from zero."""
         self.sent = self.unsent = self.received = self.unexpected = self.error_frames = 0
         self.unexpected_ids: set[int] = set()
 

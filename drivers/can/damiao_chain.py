@@ -67,16 +67,12 @@ _CALM = 0.05
 
 
 class DamiaoChain:
-    """The motors of one device on a bus.
+    """The motors of one device on a bus: the bus's settings, and those of each motor with its label, such as "joint1".
 
     Args:
         name: The device's name, for messages.
-        where: Key of the motors in the rig, for messages.
-        settings: The bus.
-        motors: The motors' settings.
-        labels: The motors in words, for example "joint1".
+        where: Key of the motors in the rig, for messages; ``source`` is the rig's file.
         mosfet_limit: Temperature at which their electronics switch off, deg C.
-        source: The rig's file, for messages.
     """
 
     def __init__(
@@ -480,7 +476,6 @@ class DamiaoChain:
     # Statistics.
 
     def reset_statistics(self) -> None:
-        """Start the figures again from zero."""
         self.cycles = self.incomplete = self.losses = 0
         for motor in self.motors:
             motor.reset_statistics()

@@ -133,7 +133,6 @@ class ChainMotor:
             self.replies += 1
 
     def decode(self) -> None:
-        """Decode the newest feedback."""
         bits = self.bits
         self.status = bits >> 60
         self.q = (bits >> 40 & 0xFFFF) * self._q_step + self._q_0
@@ -148,18 +147,14 @@ class ChainMotor:
         return self.codec.encode_command(d * (q - self.offset), d * dq, kp, kd, d * tau)
 
     def take_registers(self) -> None:
-        """Use the registers that were read."""
         self.rotor_limit = self.registers[MotorRegister.OT_VALUE]
         self.rotor_warning = self.rotor_limit - HEAT_MARGIN
 
 
 def motor_fault(motor: ChainMotor, mosfet_limit: float, *, engaged: bool) -> Fault | None:
-    """Return the fault of a motor, naming it; None without one.
+    """Return the fault of a motor, naming it; None without one. Arguments as those of ``DamiaoChain``.
 
-    Args:
-        motor: The motor.
-        mosfet_limit: Temperature at which its electronics switch off, deg C.
-        engaged: Whether the motor is in use. One that is not may have lost communication: that is its rest.
+    One that is not ``engaged`` may have lost communication: that is its rest.
     """
     status = motor.status
     if status > 1 and status != motor.acknowledged and (engaged or status != MotorStatus.LOST_COMMUNICATION):
@@ -193,12 +188,7 @@ def find_turned(motors: Sequence[ChainMotor], limits: LimitsSpec) -> Fault | Non
 
 
 def register_problems(settings: DamiaoMotorSettings, registers: dict[int, float]) -> Iterator[tuple[str, str, str]]:
-    """Yield what is wrong with a motor's registers: name of the register, message, code.
-
-    Args:
-        settings: The motor as the rig describes it.
-        registers: Number -> value of the registers that were read.
-    """
+    """Yield what is wrong with the registers that were read (number -> value): name of the register, message, code."""
     limits = settings.limits
     for register, wanted, unit in (
         (MotorRegister.PMAX, limits.position, "rad"),

@@ -152,18 +152,7 @@ class MotorCodec:
         self._p_step, self._v_step, self._t_step = 2.0 * p / 65535.0, 2.0 * v / 4095.0, 2.0 * t / 4095.0
 
     def encode_command(self, q: float, dq: float, kp: float, kd: float, tau: float) -> bytes:
-        """Return the data of a command.
-
-        Args:
-            q: Position, rad.
-            dq: Velocity, rad/s.
-            kp: Gain of the position, Nm/rad.
-            kd: Gain of the velocity, Nm s/rad.
-            tau: Torque that is added, Nm.
-
-        Raises:
-            ValueError: One of them is NaN.
-        """
+        """Return the data of a command: rad, rad/s, Nm/rad, Nm s/rad, Nm. Raises ValueError for NaN."""
         p, v, t = self._p, self._v, self._t
         position = 65535 if q >= p else 0 if q <= -p else int((q + p) * 65535.0 / self._p2)
         velocity = 4095 if dq >= v else 0 if dq <= -v else int((dq + v) * 4095.0 / self._v2)
@@ -173,11 +162,7 @@ class MotorCodec:
         return (position << 48 | velocity << 36 | stiffness << 24 | damping << 12 | torque).to_bytes(8, "big")
 
     def decode_feedback(self, data: bytes | bytearray) -> MotorFeedback:
-        """Return the content of a feedback frame.
-
-        Raises:
-            ValueError: It has not 8 bytes.
-        """
+        """Return the content of a feedback frame. Raises ValueError unless it has 8 bytes."""
         bits = read_bits(data)
         return MotorFeedback(
             bits >> 56 & 15,
@@ -219,14 +204,10 @@ def encode_register_read(motor: int, register: int) -> bytes:
 
 
 def decode_register_reply(data: bytes | bytearray, motor: int) -> RegisterReply | None:
-    """Return the content of a register's reply; None for every other frame.
+    """Return the content of a frame that ``motor`` sent to its master id; None unless it is a register's reply.
 
     Replies come at the same id as feedback. As feedback, this would be a motor that is off, one step away from -PMAX,
     where no joint can be.
-
-    Args:
-        data: Data of a frame from the motor's master id.
-        motor: The motor's id.
     """
     if len(data) == 8 and data[2] in (READ_REGISTER, WRITE_REGISTER) and data[0] | data[1] << 8 == motor:
         return RegisterReply(data[3], unpack_register(data[3], bytes(data[4:8])))
@@ -234,6 +215,5 @@ def decode_register_reply(data: bytes | bytearray, motor: int) -> RegisterReply 
 
 
 def unpack_register(register: int, data: bytes) -> float:
-    """Return a register's value from its 4 bytes."""
     value: float = struct.unpack("<I" if register in INTEGER_REGISTERS else "<f", data)[0]
     return value

@@ -64,12 +64,7 @@ _CONTROL = {0: "standby", 2: "teaching", 3: "Ethernet", 4: "Wi-Fi", 5: "remote c
 
 
 def arm_fault(status: PiperStatus, flags: Iterable[int]) -> Fault | None:
-    """Return the error that an arm reports; None if there is none.
-
-    Args:
-        status: State of the whole arm.
-        flags: Flags of the six motors (:attr:`JointStatus.flags`), joint 1 first.
-    """
+    """Return the error in the arm's state and in the flags of its motors, joint 1 first; None if there is none."""
     flags = tuple(flags)
     for bit, (code, what, remedy) in _FLAG_FAULTS.items():
         joints = join_joints(k for k, value in enumerate(flags) if value & bit)
@@ -132,15 +127,7 @@ def silence_remedy(bus: CanBus, source: str) -> str:
 
 
 class PiperLink:
-    """An arm's or a gripper's use of the bus.
-
-    Args:
-        name: The device's name, for messages.
-        settings: The bus.
-        handle: Takes each frame that is decoded.
-        ids: Ids of these frames.
-        source: The rig's file, for messages.
-    """
+    """A device's use of the bus; ``handle`` takes each decoded frame with one of ``ids``, ``source`` names the rig."""
 
     def __init__(
         self,
@@ -219,7 +206,6 @@ class PiperLink:
         return self.lost
 
     def statistics(self) -> dict[str, Any]:
-        """Return the figures of the bus; none while it is not open."""
         return {} if self.bus is None else self.bus.statistics()
 
     def _open_bus(self) -> CanBus:

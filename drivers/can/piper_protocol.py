@@ -116,7 +116,6 @@ class ModeRequest(NamedTuple):
     """0 unchanged, 1 upright, 2 on its left side, 3 on its right side; seen with the cables behind."""
 
     def frame(self) -> CanFrame:
-        """Return the frame of this record."""
         return MODE_ID, bytes((*self, 0, 0))
 
 
@@ -129,7 +128,6 @@ class JointTargets(NamedTuple):
     """rad, exact to 0.001 degrees."""
 
     def frame(self) -> CanFrame:
-        """Return the frame of this record."""
         return TARGETS_ID + self.first // 2, pack_pair(self.q, MILLIDEGREES)
 
 
@@ -146,7 +144,6 @@ class GripperRequest(NamedTuple):
     """Whether the present position becomes the zero."""
 
     def frame(self) -> CanFrame:
-        """Return the frame of this record."""
         code = int(self.enabled) | int(self.clear_error) << 1
         return GRIPPER_ID, pack(">iHBB", self.width * 1e6, self.torque * 1e3, code, SET if self.set_zero else 0)
 
@@ -159,7 +156,6 @@ class EnableRequest(NamedTuple):
     enabled: bool = True
 
     def frame(self) -> CanFrame:
-        """Return the frame of this record."""
         return ENABLE_ID, bytes((self.motor, 2 if self.enabled else 1, 0, 0, 0, 0, 0, 0))
 
 
@@ -172,7 +168,6 @@ class LimitQuery(NamedTuple):
     """1 range and speed, 2 acceleration."""
 
     def frame(self) -> CanFrame:
-        """Return the frame of this record."""
         return LIMIT_QUERY_ID, bytes((*self, 0, 0, 0, 0, 0, 0))
 
 
@@ -204,7 +199,6 @@ class FirmwareQuery(NamedTuple):
     """Question for the firmware's version (0x4AF), answered by :class:`FirmwarePiece` frames."""
 
     def frame(self) -> CanFrame:
-        """Return the frame of this record."""
         return FIRMWARE, bytes((1, 0, 0, 0, 0, 0, 0, 0))
 
 
@@ -388,7 +382,6 @@ def pack_pair(values: Sequence[float], scale: float, second: float | None = None
 
 
 def unpack_angles(data: bytes) -> tuple[float, float]:
-    """Return the two angles of a frame, rad."""
     a, b = _PAIR.unpack(data)
     return a / MILLIDEGREES, b / MILLIDEGREES
 

@@ -132,12 +132,7 @@ def judge_interface(found: CanInterface, settings: BusSettings) -> CheckResult:
 
 
 def bus_load(frames: float, settings: BusSettings) -> float:
-    """Return the share of the time that a bus is busy.
-
-    Args:
-        frames: Frames in each second, with 8 bytes each.
-        settings: The bus.
-    """
+    """Return the share of the time that a bus is busy with so many frames of 8 bytes in a second."""
     if not settings.fd:
         return frames * _CLASSIC_BITS / settings.bit_rate
     slow, fast = _FD_BITS
@@ -155,14 +150,7 @@ class _Traffic(NamedTuple):
 
 
 def _judge_load(expected: float, traffic: _Traffic, frames: float, settings: BusSettings) -> CheckResult:
-    """Return whether the bus is fast enough.
-
-    Args:
-        expected: Frames in each second while the arm is driven.
-        traffic: What was measured.
-        frames: Frames in each second that were expected in the measurement.
-        settings: The bus.
-    """
+    """Return whether the bus is fast enough for the frames per second when driven; ``frames`` are those at rest."""
     load, measured = bus_load(expected, settings), bus_load(traffic.frames / traffic.seconds, settings)
     found = f"{1e2 * load:.0f} % load expected when driven, {1e2 * measured:.0f} % measured at rest"
     if traffic.strangers:
@@ -183,15 +171,7 @@ def _judge_load(expected: float, traffic: _Traffic, frames: float, settings: Bus
 
 
 def check_damiao(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
-    """Check an arm of Damiao motors, with its gripper if that is of the same driver.
-
-    Args:
-        spec: The arm in the rig.
-        duration: Time for measuring the answers, s.
-
-    Yields:
-        One result per check.
-    """
+    """Check an arm of Damiao motors, and its gripper of this driver; measure the answers for ``duration`` s."""
     settings = DamiaoArmSettings.of(spec)
     if not (yield from _check_interface(settings)):
         return
@@ -382,7 +362,6 @@ class _PiperReports:
         self.firmware: list[bytes] = []
 
     def take(self, record: PiperFeedback) -> None:
-        """Keep a record."""
         self.frames += 1
         match record:
             case PiperStatus():
@@ -411,15 +390,7 @@ class _PiperReports:
 
 
 def check_piper(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
-    """Check a PiPER, with its gripper.
-
-    Args:
-        spec: The arm in the rig.
-        duration: Time for measuring the bus load, s.
-
-    Yields:
-        One result per check.
-    """
+    """Check a PiPER, with its gripper; measure the bus load for ``duration`` s."""
     settings = PiperArmSettings.of(spec)
     if not (yield from _check_interface(settings)):
         return

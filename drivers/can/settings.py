@@ -55,11 +55,7 @@ def group_key(options: Mapping[str, Any]) -> str | None:
 
 
 def emulator_remedy(source: str) -> str:
-    """Return the command that starts the emulator of a rig, as the remedy of a message.
-
-    Args:
-        source: The rig's file; a rig without one (``<dict>``, or an empty text) needs one for its emulator.
-    """
+    """Return the command that starts the emulator of a rig's file; ``<dict>`` and "" stand for a rig without one."""
     known = bool(source) and not source.startswith("<")
     file = shlex.quote(source) if known else "FILE, with the rig in a file"
     return f"start the emulator in another terminal: hal emulate can --config {file}"
@@ -190,7 +186,6 @@ class BusSettings(DeviceSettings):
 
     @property
     def shared(self) -> BusSettings:
-        """These settings without those of a device."""
         return BusSettings(**{name: getattr(self, name) for name in BusSettings.model_fields})
 
 
@@ -222,7 +217,6 @@ class DamiaoMotorSettings(Strict):
 
     @cached_property
     def limits(self) -> MotorRange:
-        """Ranges of the numbers in the motor's frames."""
         return self.ranges or MOTOR_RANGES[self.type]
 
     @model_validator(mode="after")
@@ -274,7 +268,6 @@ class PiperArmSettings(BusSettings):
 
     @property
     def mounting_code(self) -> int:
-        """The mounting as a number of the protocol."""
         return 0 if self.mounting is None else 1 + ("upright", "left", "right").index(self.mounting)
 
 

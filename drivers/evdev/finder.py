@@ -21,8 +21,6 @@ from hal.pads.model import Identity
 
 
 class NodeInfo(NamedTuple):
-    """One input device that is not opened."""
-
     path: str
     identity: Identity
     uniq: str
@@ -56,8 +54,6 @@ def permission_note(info: NodeInfo) -> str:
 
 
 class Event(NamedTuple):
-    """One input event."""
-
     kind: int
     code: int
     value: int
@@ -96,12 +92,7 @@ class EvdevNode:
     """
 
     def __init__(self, path: str) -> None:
-        """Open the device at ``path``.
-
-        Raises:
-            OSError: There is no such device, or it may not be read.
-            DriverMissing: python-evdev is not installed.
-        """
+        """Open a device. Raises OSError if it is missing or may not be read, DriverMissing without python-evdev."""
         self.path = path
         self._device: Any = evdev_module().InputDevice(path)
         capabilities: dict[int, list[Any]] = self._device.capabilities()
@@ -153,7 +144,6 @@ class EvdevNode:
         self._device.grab()
 
     def close(self) -> None:
-        """Close the device. Idempotent."""
         self._device.close()
 
 

@@ -92,14 +92,9 @@ class PadLink:
     # Events.
 
     def poll(self, now: float, timeout: float) -> None:
-        """Read every event; wait for the first one for up to ``timeout`` s.
+        """Read every event; wait for the first one for up to ``timeout`` s. Raises OSError if the pad is gone.
 
-        Args:
-            now: Time on the rig's clock, s; in lock-step that is not the clock of the events.
-            timeout: Longest wait, s.
-
-        Raises:
-            OSError: The pad is gone.
+        ``now`` is the time on the rig's clock, s; in lock-step that is not the clock of the events.
         """
         ahead = now - time.monotonic()
         for _, flags in self._poller.poll(timeout * 1e3):
@@ -169,7 +164,6 @@ class PadLink:
         return self._rumble is not None and self._rumble.play(strong, weak, seconds)
 
     def close(self) -> None:
-        """Close the devices. Idempotent."""
         if self._rumble is not None:
             self._rumble.close()
         for node in (self._node, self._motion, self._touch):

@@ -77,12 +77,7 @@ class EvdevPad(GamepadDriver):
         )
 
     def open(self) -> None:
-        """Look for the pad; one that is not there may come later.
-
-        Raises:
-            NotSupported: This is not Linux.
-            DriverMissing: python-evdev is not installed.
-        """
+        """Look for the pad, which may come later. Raises NotSupported except on Linux, and DriverMissing."""
         if self._on_this_machine:
             if sys.platform != "linux":
                 raise NotSupported("the evdev driver reads gamepads on Linux only", code="linux_only")

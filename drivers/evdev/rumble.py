@@ -33,13 +33,7 @@ class Rumble:
     """
 
     def __init__(self, fd: int, strong: float, weak: float) -> None:
-        """Upload the first effect, :data:`RUMBLE_SECONDS` long, in the background.
-
-        Args:
-            fd: Descriptor of the device; it stays the caller's.
-            strong: Share (0..1) of the heavy motor's strength.
-            weak: The same for the light motor.
-        """
+        """Upload the first effect, :data:`RUMBLE_SECONDS` long, in the background; strengths are 0..1."""
         self._fd = fd
         self._effect = -1
         self._ready: tuple[float, float, float] | None = None

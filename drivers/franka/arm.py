@@ -271,9 +271,7 @@ class FrankaArm(RobotDriver):
     def recover(self) -> None:
         """Run the automatic error recovery, and wait until the robot is idle.
 
-        Raises:
-            RobotFault: Where that does not help (user stop, guiding); ``code`` is the fault's.
-            ConnectionLost: If the robot does not answer.
+        Raises RobotFault where that does not help (user stop, guiding), ConnectionLost if the robot does not answer.
         """
         link, s = self._connection.link, self._sample
         if link is None or s is None:
@@ -334,14 +332,7 @@ def _dynamics(spec: RobotSpec) -> Dynamics:
 
 
 def create_link(arm: str) -> ArmLink:
-    """Create a link to an arm, not connected yet. The vendor's library is imported here.
-
-    Args:
-        arm: ``fr3`` or ``fer`` (the Panda).
-
-    Raises:
-        DriverMissing: If the vendor's library is not installed.
-    """
+    """Create a link to an arm, ``fr3`` or ``fer`` (the Panda), not connected yet. Raises DriverMissing."""
     try:
         if arm == "fr3":
             from .fr3 import Fr3Link
@@ -402,10 +393,7 @@ class ArmConnection:
     def open(self) -> ArmSample:
         """Reserve the arm, connect, and return its first state.
 
-        Raises:
-            ControlTaken: If another program on this computer uses the arm.
-            DriverMissing: If the vendor's library is not installed.
-            ConnectionLost: If the robot cannot be reached; ``code`` is the fault's.
+        Raises ControlTaken, DriverMissing, and ConnectionLost with the fault's ``code`` if the robot cannot be reached.
         """
         self._lock = lock_arm(resolve_host(self.settings.host) or self.settings.host)
         try:

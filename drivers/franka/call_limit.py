@@ -20,8 +20,6 @@ _SIGEV_THREAD = 2
 
 
 class _Event(ctypes.Structure):
-    """sigevent(7)"""
-
     _fields_ = (
         ("value", ctypes.c_void_p),
         ("number", ctypes.c_int),
@@ -65,7 +63,6 @@ class CallLimit:
             self._set(self._timer, 0, self._on, None)
 
     def stop(self) -> None:
-        """End the limit."""
         if self._set is not None:
             self._set(self._timer, 0, self._off, None)
 

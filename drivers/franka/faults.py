@@ -232,7 +232,6 @@ def fault_of(names: Sequence[str], robot_mode: str, realtime_kernel: bool | None
         names: Flags that are set now, or that ended the last motion; in the modes ``idle`` and ``move`` they are
             history and are ignored.
         robot_mode: Mode in the spelling of any library (``Reflex``, ``kUserStopped``, ``user_stopped``).
-        realtime_kernel: Whether this computer has a real-time kernel; None if unknown.
     """
     mode = _plain(robot_mode)
     if mode in ("idle", "move"):
@@ -250,13 +249,9 @@ def fault_of_exception(
     port: int = ARM_PORT,
     realtime_kernel: bool | None = None,
 ) -> Fault:
-    """Return the fault that an exception of a client library stands for.
+    """Return the fault that an exception of ``pylibfranka`` or ``panda_py`` stands for.
 
-    Args:
-        error: Exception of ``pylibfranka`` or ``panda_py``.
-        host: Address of the robot, for the texts; None for "the robot".
-        port: Port of the connection; a refusal at the hand's port means that there is no hand.
-        realtime_kernel: As in :func:`fault_of`.
+    A refusal at the hand's port means that there is no hand. Without a ``host`` the texts name "the robot".
     """
     text = str(error)
     versions = _versions_in(error, text)

@@ -220,11 +220,7 @@ LOSSY_FLAGS = frozenset(
 
 
 def flag_index(name: str) -> int:
-    """Return the position of a flag in a state packet, from its name or its number in digits.
-
-    Raises:
-        ValueError: For an unknown flag; the message lists all.
-    """
+    """Return the position of a flag, by its name or its number in digits. Raises ValueError, which lists all flags."""
     if name.isdigit() and int(name) < len(FLAGS):
         return int(name)
     if name in FLAGS:

@@ -51,9 +51,8 @@ class FrankaHand(GripperDriver):
     def open(self) -> None:
         """Connect, and wait for a first state. Nothing moves.
 
-        Raises:
-            ConnectionLost: If the hand cannot be reached, or sends no states.
-            NotSupported: If the hand's protocol version is not that of the client library.
+        Raises ConnectionLost if the hand cannot be reached, or sends no states, NotSupported for another protocol
+        version.
         """
         if self._is_open:
             return

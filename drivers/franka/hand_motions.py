@@ -179,12 +179,7 @@ class HandCommand(ABC):
 
     @abstractmethod
     def next(self, state: HandState, ended: EndedCall | None) -> GripperCall | CommandResult:
-        """Return the next motion, or the result, while the fingers rest.
-
-        Args:
-            state: Newest state.
-            ended: Last motion since the command was given; None if there was none.
-        """
+        """Return the next motion, or the result, while the fingers rest; ``ended`` is the command's last motion."""
 
     @abstractmethod
     def accepts(self, call: GripperCall, state: HandState) -> bool:
@@ -365,15 +360,12 @@ class HandController:
     # Commands.
 
     def move(self, width: float, speed: float, force: float) -> None:
-        """Move the fingers to ``width`` (m), or until they meet an object."""
         self._accept(WidthCommand(self.range, width, speed, force))
 
     def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
-        """Close on an object and hold it."""
         self._accept(GraspCommand(self.range, width, speed, force, inner, outer, self._force))
 
     def home(self) -> None:
-        """Measure how far the fingers open."""
         self._accept(HomeCommand(self.range))
 
     def stop(self) -> None:
@@ -388,7 +380,6 @@ class HandController:
     # Events.
 
     def update(self, state: HandState) -> None:
-        """Process a new state."""
         before, self.state = self.state, state
         if before is not None and state.t_hand > before.t_hand:  # after a stall, states arrive in a bunch
             self.speed = (state.width - before.width) / (state.t_hand - before.t_hand)

@@ -76,9 +76,7 @@ class HandLink:
     def open(self) -> None:
         """Connect, and wait until the connection is up.
 
-        Raises:
-            ConnectionLost: If the hand cannot be reached; the message says what to do.
-            NotSupported: If the hand's protocol version is not that of the client library.
+        Raises ConnectionLost, which says what to do, and NotSupported for another protocol version than the library's.
         """
         self._start(retry=False)
         assert self._child is not None
@@ -174,7 +172,6 @@ class HandLink:
             child.close(timeout=1.0)
 
     def close(self) -> None:
-        """Disconnect. Idempotent."""
         self._end()
 
 
@@ -182,13 +179,7 @@ class HandLink:
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
-    """Entry point of the client process.
-
-    Args:
-        channel: Connection to the driver.
-        memories: Unused.
-        config: ``host``, and ``retry``: whether to try again after a failed attempt to connect.
-    """
+    """Entry point of the client process. With ``retry`` in ``config``, a failed attempt to connect is repeated."""
     signal.alarm(_HUNG)
     parent = os.getppid()
     host, retry = config["host"], config["retry"]

@@ -25,12 +25,9 @@ from hal.lock import DeviceLock
 
 
 def lock_arm(host: str) -> DeviceLock:
-    """Reserve the arm at ``host`` for this process.
+    """Reserve the arm at ``host`` for this process. Raises ControlTaken, with the other process's number.
 
     The arm's process of a program that has just ended brakes first, so this waits up to 1 s for it.
-
-    Raises:
-        ControlTaken: If another program on this computer uses the arm; the message has its process number.
     """
     return DeviceLock(f"franka-{host}", f"the arm at {host}", patience=1.0)
 
@@ -160,11 +157,7 @@ class RoundTrips:
 
 
 def measure_round_trips(address: str, duration: float) -> RoundTrips:
-    """Ping an address 1000 times a second for ``duration`` s.
-
-    Raises:
-        NotMeasured: If this user may not ping.
-    """
+    """Ping an address 1000 times a second for ``duration`` s. Raises NotMeasured if this user may not."""
     try:
         with _icmp_socket() as sock:
             sock.setblocking(False)

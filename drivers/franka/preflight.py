@@ -57,15 +57,7 @@ _IMPROVE = "connect the cable directly to Control's LAN port, end busy programs,
 
 
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
-    """Check one arm. Nothing moves, and no connection stays open.
-
-    Args:
-        spec: The arm in the rig.
-        duration: Time for measuring the network, s.
-
-    Yields:
-        One result per check.
-    """
+    """Check one arm, and measure its network for ``duration`` s. Nothing moves, and no connection stays open."""
     settings = ArmSettings.of(spec)
     try:
         lock = lock_arm(settings.host)
@@ -215,12 +207,8 @@ def _query_robot(host: str, arm: str) -> dict[str, Any] | None:
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
     """Entry point of the process that connects to the robot. Nothing moves.
 
-    Args:
-        channel: Receives the report: ``protocol``, ``mode``, ``flags`` and ``noise`` (rad, by how much the commanded
-            positions differ that an arm at rest reports); or ``missing``, the name of a library; or ``fault``: code,
-            cause and remedy.
-        memories: Unused.
-        config: ``host`` and ``arm``, as in the settings.
+    It sends ``protocol``, ``mode``, ``flags`` and ``noise`` (rad, by how much the commanded positions differ that an
+    arm at rest reports); or ``missing``, the name of a library; or ``fault``: code, cause and remedy.
     """
     import resource
 

@@ -35,12 +35,9 @@ class PictureStamp(NamedTuple):
 
 
 def read_picture(color: NDArray[np.uint8]) -> PictureStamp:
-    """Return the number and the time that are written into the first four pixels of a mock picture.
+    """Return the number and the time that are written into the first four pixels of a :class:`MockCamera`'s picture.
 
     With it a test proves that a picture was neither changed nor confused with another one (without lossy compression).
-
-    Args:
-        color: (H, W, 3) RGB picture of a :class:`MockCamera`.
     """
     head = np.ascontiguousarray(color).reshape(-1)[:_HEAD].tobytes()
     return PictureStamp(int.from_bytes(head[:4], "little"), int.from_bytes(head[4:], "little", signed=True) / 1e6)

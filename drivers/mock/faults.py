@@ -104,14 +104,10 @@ class MockDevice(Generic[_F]):
     is_open = False
 
     def inject(self, **faults: object) -> None:
-        """Set faults; those that are not named stay as they are.
+        """Set fields of :attr:`faults`; those that are not named stay as they are.
 
-        Args:
-            faults: Fields of :attr:`faults` with their new values.
-
-        Raises:
-            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
-                (``bad_fault_value``); nothing changes.
+        Raises CommandError if there is no such fault (code ``unknown_fault``), or it cannot have that value
+        (``bad_fault_value``); nothing changes.
         """
         known = [f.name for f in fields(self.faults)]
         for name, value in faults.items():

@@ -59,15 +59,10 @@ class MockPad(MockDevice[MockPadFaults], GamepadDriver):
         self.set(axes={axis: value})
 
     def set(self, axes: Mapping[str, float] | None = None, buttons: Iterable[str] | None = None) -> None:
-        """Move the named axes, and press exactly the given buttons.
+        """Move the named axes, and press exactly the given buttons; None leaves them as they are.
 
-        Args:
-            axes: Axis -> value; None leaves the axes as they are.
-            buttons: All pressed buttons; None leaves the buttons as they are.
-
-        Raises:
-            CommandError: Unknown name (code ``unknown_control``), or value out of range (``out_of_range``); nothing
-                changes.
+        Raises CommandError for an unknown name (code ``unknown_control``) or a value out of range (``out_of_range``);
+        nothing changes.
         """
         wanted = None if buttons is None else frozenset(buttons)
         _check(axes or {}, wanted or frozenset())
@@ -133,7 +128,6 @@ class MockPad(MockDevice[MockPadFaults], GamepadDriver):
         return "a mock pad"
 
     def inject(self, **faults: object) -> None:
-        """Set faults: see :meth:`MockDevice.inject`."""
         super().inject(**faults)
         self._news.set()
 

@@ -46,7 +46,7 @@ class ContactParameters(NamedTuple):
 
 
 def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactParameters:
-    """Return the parameters of the shapes of a link.
+    """Return the parameters of the shapes of a link with this mass, kg; ``h`` is MuJoCo's step, s.
 
     In a contact MuJoCo uses the greater friction of the two, not their product as this project means it: half of each
     (:data:`USUAL_FRICTION`) makes both the same where at least one of the two has the usual friction, and neither less.
@@ -54,11 +54,6 @@ def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactPa
 
     A contact in MuJoCo has a stiffness per mass, and loses a share of its force that acts like more mass. The share
     is chosen so that a spring of this stiffness is stable at this step.
-
-    Args:
-        contact: Properties of the link's contacts.
-        mass: Mass of the link, kg.
-        h: Step of MuJoCo, s.
     """
     friction = (USUAL_FRICTION * contact.lateral_friction, contact.spinning_friction, contact.rolling_friction)
     condim = 6 if contact.rolling_friction > 0.0 else 4 if contact.spinning_friction > 0.0 else 3
@@ -138,15 +133,7 @@ def find_contacts(
 ) -> list[dict[str, Any]]:
     """Return the contacts of the last step, as :meth:`.SimulatedWorld.contacts` does; None stands for any body.
 
-    Args:
-        mujoco: The module.
-        model: The model.
-        data: Its data after the step.
-        bodies: All bodies.
-        a: See :meth:`.SimulatedWorld.contacts`.
-        b: The same.
-        only: MuJoCo's numbers of the links that have the contacts; None for all.
-        without: MuJoCo's numbers of links without contacts.
+    ``only`` are MuJoCo's numbers of the links that have the contacts, ``without`` those of links that have none.
     """
     owners = {number: (body, link) for body in bodies for number, link in zip(body.ids, body.links, strict=True)}
     found, force = [], np.zeros(6)
@@ -215,7 +202,6 @@ def distance(mujoco: Any, model: Any, data: Any, a: Sequence[int], b: Sequence[i
 def cast_ray(
     mujoco: Any, model: Any, data: Any, bodies: Iterable[Body], start: Sequence[float], end: Sequence[float]
 ) -> RayFound | None:
-    """Return what a ray meets first."""
     here, along = np.array(start, float), np.subtract(end, start)
     geom, normal = np.full((1, 1), -1, np.int32), np.zeros((3, 1))
     groups = np.array([[one] for one in (1, 1, 1, 1, 1, 0)], np.uint8)  # without CARRIED

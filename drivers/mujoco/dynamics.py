@@ -22,14 +22,7 @@ def read_dynamics(model: Any, body: Body, link: int) -> dict[str, Any]:
 
 
 def write_dynamics(spec: Any, body: Body, link: int, values: Mapping[str, Any]) -> None:
-    """Set some of the values of :func:`read_dynamics` in what the model is compiled from.
-
-    Args:
-        spec: The ``mujoco.MjSpec``.
-        body: The body.
-        link: Number of the link.
-        values: New values by name.
-    """
+    """Set some of the values of :func:`read_dynamics`, by name, in the ``mujoco.MjSpec``."""
     contact, node = body.contacts[link], spec.body(body.link_path(link))
     node.mass = values.get("mass", node.mass)
     node.inertia = values.get("inertia", node.inertia)

@@ -13,11 +13,7 @@ from hal.kinematics.urdf import UrdfMimic
 
 
 def load_mujoco() -> Any:
-    """Import and return the ``mujoco`` module.
-
-    Raises:
-        DriverMissing: It is not installed.
-    """
+    """Import and return the ``mujoco`` module. Raises DriverMissing."""
     if "mujoco" in sys.modules:
         return sys.modules["mujoco"]
     try:
@@ -91,6 +87,5 @@ class Body(SimulatedBody):
 
 
 def wxyz(orientation: Any) -> list[float]:
-    """Return a quaternion xyzw in MuJoCo's order."""
     x, y, z, w = orientation
     return [w, x, y, z]

@@ -134,8 +134,8 @@ class BodyPlan:
 def plan_object(spec: BodySpec) -> BodyPlan:
     """Return the plan of an object.
 
-    Raises:
-        ConfigError: Its file is missing or broken, MuJoCo cannot take it, or a size that its shape needs is missing.
+    Raises ConfigError if its file is missing or broken, MuJoCo cannot take it, or a size that its shape needs is
+    missing.
     """
     if spec.shape != "urdf":
         hulls = hulls_of(spec) if spec.shape == "mesh" else ()
@@ -174,14 +174,10 @@ def plan_object(spec: BodySpec) -> BodyPlan:
 
 
 def plan_robot(spec: RobotSpec, *, mirrored: bool = False) -> BodyPlan:
-    """Return the plan of an arm, with its base fixed in the world.
+    """Return the plan of an arm, with its base fixed in the world. Raises ConfigError, as :func:`plan_object`.
 
-    Args:
-        spec: The arm's record.
-        mirrored: It mirrors a real arm: nothing in the world stops its joints, and its fingers have their grip force.
-
-    Raises:
-        ConfigError: As of :func:`plan_object`, or a joint or link that the record names is not in the URDF.
+    One that is ``mirrored`` mirrors a real arm: nothing in the world stops its joints, and its fingers have their grip
+    force.
     """
     key = f"robots.{spec.name}.urdf"
     urdf = checked_urdf(spec.urdf, key)
@@ -403,7 +399,6 @@ _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def _frame(axes: Array, position: Array | float = 0.0) -> Array:
-    """Return the transform (4, 4) with these columns as its axes."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = axes, position
     return matrix
@@ -413,12 +408,7 @@ def _frame(axes: Array, position: Array | float = 0.0) -> Array:
 
 
 def build(model: Any, plan: BodyPlan) -> None:
-    """Add a body to a model. Links, joints and shapes of one body do not collide with each other.
-
-    Args:
-        model: A ``mujoco.MjSpec``.
-        plan: The body.
-    """
+    """Add a body to a ``mujoco.MjSpec``. Links, joints and shapes of one body do not collide with each other."""
     mujoco = load_mujoco()
     body = plan.body
     made: list[Any] = []

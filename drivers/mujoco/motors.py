@@ -63,7 +63,6 @@ class Motors:
         self._to_acceleration = np.array([-1.0, 1.0, 1.0]) / h
 
     def bind(self, mujoco: Any, model: Any, data: Any) -> None:
-        """Drive the joints of a model that was compiled."""
         n = self.n
         self._mujoco = mujoco
         self._at_rest: Any = None
@@ -165,12 +164,9 @@ class Motors:
             self.applied[at] = torques + self._gravity[: self.n][at]
 
     def _share(self, excess: Array) -> None:
-        """Expect less of motors at their limit, and choose the torques of their arms' other joints.
+        """Expect less of motors whose torques lack ``excess``, Nm or N, and choose those of their arms' other joints.
 
         A joint at its limit moves less than wanted, which changes what the others need to move as wanted.
-
-        Args:
-            excess: What each torque lacks, Nm or N.
         """
         self.wanted += excess * self._alone
         for name, arm in self.arms.items():

@@ -21,18 +21,13 @@ _COUNTS = ("ntree_awake", "nbody_awake", "nparent_awake", "nv_awake")
 
 
 class Sleep:
-    """Which objects of one world sleep.
+    """Which objects of one world sleep. The model is changed: it may sleep from now on.
 
     Only objects with a free base and no joints of their own fall asleep, each together with all that it touches. A
     contact with something that is awake, a force and a changed pose or velocity wake them (MuJoCo's own rules); all
     other changes of the world have to call :meth:`wake`. Nothing of an object that sleeps changes.
 
     MuJoCo's own state of a simulation (``mj_getState``) is without sleep, so :meth:`save` and :meth:`restore` add it.
-
-    Args:
-        mujoco: The module.
-        model: The model, which is changed: it may sleep from now on.
-        data: Its data, in which nothing sleeps yet.
     """
 
     def __init__(self, mujoco: Any, model: Any, data: Any) -> None:

@@ -36,17 +36,10 @@ _POSE = ("position", "orientation")
 
 
 class MujocoWorld(SimulatedWorld[Body]):
-    """One model of MuJoCo's and all bodies in it.
+    """One model of MuJoCo's and all bodies in it. Raises DriverMissing, and ConfigError with every problem.
 
     Arms come first in the model, so that their joints are the first degrees of freedom. An object is added or removed
     by compiling the model again; all other bodies keep their state.
-
-    Args:
-        spec: The record of the world.
-
-    Raises:
-        ConfigError: Something in the record cannot be loaded; lists every problem.
-        DriverMissing: MuJoCo is not installed.
     """
 
     ENGINE = "MuJoCo"

@@ -15,11 +15,8 @@ from .motors import position_gain
 class AttachedObjects:
     """Keeps objects that are attached to a link of an arm, such as a board in a gripper, at that link.
 
-    They take no part in the physics: they have no weight and touch nothing.
-
-    Args:
-        client: The world.
-        places: Each object, its arm, and the index of the arm's link.
+    They take no part in the physics: they have no weight and touch nothing. ``places`` has each object, its arm, and
+    the index of the arm's link.
     """
 
     def __init__(self, client: PyBulletClient, places: Sequence[tuple[Body, Body, int]]) -> None:
@@ -77,7 +74,6 @@ class MirroredArm:
         self._hold()
 
     def follow(self, positions: list[float], speeds: list[float], width: float | None) -> None:
-        """Take the state of the arm: see :meth:`hal.world.WorldDriver.follow`."""
         if width is not None and self._fingers:
             self._follow_width(width)
         client = self._client

@@ -54,18 +54,10 @@ def read_dynamics(client: PyBulletClient, body: Body, link: int) -> dict[str, An
 def write_dynamics(
     client: PyBulletClient, body: Body, link: int, wanted: Mapping[str, Any], before: Mapping[str, Any], dt: float
 ) -> None:
-    """Set some of the values of :func:`read_dynamics`.
+    """Set some of the values of :func:`read_dynamics`, which were ``before``, at a physics step of ``dt`` s.
 
     A new mass needs an inertia beside it: PyBullet alone would replace the URDF's by that of the collision shape. It
     takes contact_stiffness and contact_damping only together.
-
-    Args:
-        client: The world.
-        body: The body.
-        link: Index of the link.
-        wanted: New values by name.
-        before: The present values.
-        dt: The physics step, s.
     """
     arguments = {_SCALARS[n][0]: v for n, v in wanted.items() if n in _SCALARS and n not in _CONTACT}
     if "inertia" in wanted:
@@ -159,14 +151,12 @@ def distance(client: PyBulletClient, a: Body, links_a: Sequence[int], b: Body, l
 def cast_ray(
     client: PyBulletClient, bodies: Iterable[Body], start: Sequence[float], end: Sequence[float]
 ) -> RayFound | None:
-    """Return what a ray meets first."""
     number, link, _, position, normal = client.rayTest(start, end)[0]
     body = next((body for body in bodies if body.id == number), None)
     return None if body is None else RayFound(body, link, position, normal)
 
 
 def apply_force(client: PyBulletClient, force: AppliedForce[Body]) -> None:
-    """Let a force act in the next step."""
     number, link = force.body.id, force.link
     if force.point is not None:
         state = None if link == -1 else client.getLinkState(number, link)

@@ -69,11 +69,7 @@ def _flush() -> None:
 
 
 def load_pybullet() -> Any:
-    """Import and return the ``pybullet`` module.
-
-    Raises:
-        DriverMissing: It is not installed.
-    """
+    """Import and return the ``pybullet`` module. Raises DriverMissing."""
     if "pybullet" in sys.modules:
         return sys.modules["pybullet"]
     try:
@@ -90,13 +86,8 @@ def load_pybullet() -> Any:
 class PyBulletClient:
     """PyBullet's functions with the id of one world filled in; ``client.stepSimulation()`` steps that world.
 
-    Each function is bound once, so a call costs no look-up (``pybullet_utils``' client binds it at every call).
-
-    Args:
-        gui: Open PyBullet's window.
-
-    Raises:
-        DriverMissing: PyBullet is not installed, or its window cannot open.
+    Each function is bound once, so a call costs no look-up (``pybullet_utils``' client binds it at every call). Raises
+    DriverMissing if PyBullet is not installed, or its window cannot open.
     """
 
     def __init__(self, *, gui: bool = False) -> None:
@@ -129,17 +120,11 @@ class PyBulletClient:
 
 
 class Gear:
-    """A coupling that makes one joint of a body follow another one.
+    """A coupling that makes the joint ``follower`` of a body follow the joint ``leader``.
 
     ``q[follower] = multiplier * q[leader]``, plus their difference when it is engaged. It acts between the two joints,
-    so a finger that is blocked holds back the other one too.
-
-    Args:
-        body: PyBullet's number of the body.
-        leader: Index of the joint that is followed.
-        follower: Index of the joint that follows.
-        multiplier: Ratio of their motions.
-        effort: Greatest torque or force of the two joints, Nm or N.
+    so a finger that is blocked holds back the other one too. ``effort`` is the greatest torque or force of both, Nm or
+    N.
     """
 
     def __init__(
@@ -212,7 +197,6 @@ class Body(SimulatedBody):
         return any(joint.damping > 0.0 for joint in joints if joint.movable)
 
     def base_pose(self, client: PyBulletClient) -> Transform:
-        """Return the pose of the base link in the world."""
         return compose(client.getBasePositionAndOrientation(self.id), inverse(self.inertial))
 
     def set_base_pose(self, client: PyBulletClient, pose: Transform) -> None:

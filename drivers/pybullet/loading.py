@@ -42,18 +42,9 @@ The drive that moves with it is in no URDF. Fingers at rest have their own mass,
 
 
 def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> tuple[Body, list[str]]:
-    """Load an object.
+    """Load an object, with its visual shapes if it is ``drawn``; return it with warnings for the user.
 
-    Args:
-        client: The world.
-        spec: The object's record.
-        drawn: Load its visual shapes too.
-
-    Returns:
-        The body, and warnings for the user.
-
-    Raises:
-        ConfigError: Its file is missing or broken, or a size that its shape needs is missing.
+    Raises ConfigError if its file is missing or broken, or a size that its shape needs is missing.
     """
     key = f"objects.{spec.name}"
     if spec.shape == "mesh":
@@ -357,21 +348,13 @@ def _lighten_frames(client: PyBulletClient, body: Body, urdf: UrdfModel) -> None
 
 
 def fix_inertias(client: PyBulletClient, body: Body, massless: Container[str]) -> list[str]:
-    """Replace impossible inertias of links, which are common in URDF files, by those of their collision shapes.
+    """Replace impossible inertias of links by those of their collision shapes; return warnings for the user.
 
     The mass of a link lies inside the box around its collision shape. If all of it were in the corners, the inertia
     would be three times that of a uniform box, which is what PyBullet computes for a shape; no body has more.
     Placeholders such as 0.1 kg m2 for a finger of 0.1 kg break this bound by orders of magnitude; a wrist with them
     needs more torque than it has to keep its own acceleration limits. Links without a shape, or with a possible
-    inertia, keep the file's.
-
-    Args:
-        client: The world.
-        body: The body whose links are checked.
-        massless: Links without an inertia in the file; no warning is given for them.
-
-    Returns:
-        Warnings for the user.
+    inertia, keep the file's. For ``massless`` links, without an inertia in the file, no warning is given.
     """
     fixed_links = []
     for name, link in body.links.items():

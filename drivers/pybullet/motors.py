@@ -34,15 +34,9 @@ def position_gain(dt: float) -> float:
 
 
 def hold(client: PyBulletClient, body: Body, targets: Mapping[int, float], dt: float) -> None:
-    """Drive joints to positions and keep them there, within their speed and effort.
+    """Drive joints (index -> position, rad or m) and keep them there, within their speed and effort.
 
     The speed limit stays with each motor: it bounds every later set-point of that joint as well.
-
-    Args:
-        client: The world.
-        body: The body.
-        targets: Position by joint index, rad or m.
-        dt: The physics step, s.
     """
     for joint, position in targets.items():
         client.setJointMotorControl2(
@@ -94,13 +88,9 @@ class PassiveJoints:
 
 
 class SimulatedDynamics:
-    """Gravity and inertia of a body as PyBullet simulates it, computed by pinocchio.
+    """Gravity and inertia of an arm as PyBullet simulates it, computed by pinocchio.
 
     PyBullet's own inverse dynamics keep the masses, and the place of the base, of the first call.
-
-    Args:
-        client: The world.
-        body: An arm.
     """
 
     def __init__(self, client: PyBulletClient, body: Body) -> None:
@@ -203,13 +193,10 @@ class JointTorques:
         """That of the body to which the torques were added."""
 
     def take_over(self, dq: Floats) -> None:
-        """Switch the joints' own motors off, and start to apply torques.
+        """Switch the motors off, which follow these speeds (n,), rad/s, and start to apply torques.
 
         PyBullet's solver stops before its motors have exactly the speed that they follow. In the first step they get
         there, within their effort, so that an arm that was held does not drift away.
-
-        Args:
-            dq: Speeds (n,) that the motors follow, rad/s.
         """
         self.switch_off()
         self._applied = self._sum = [0.0] * len(self._joints)

@@ -22,13 +22,8 @@ _SAMPLE = (0.0, 1.0)
 class TinyRenderer(Renderer):
     """Draws in software and without shadows: available wherever PyBullet is, several times slower than OpenGL.
 
-    It has a PyBullet client of its own, in which each visual shape is a body that nothing touches.
-
-    Args:
-        scene: What is drawn.
-
-    Raises:
-        DriverMissing: PyBullet is not installed.
+    It has a PyBullet client of its own, in which each visual shape is a body that nothing touches. Raises
+    DriverMissing.
     """
 
     def __init__(self, scene: RenderScene) -> None:

@@ -31,9 +31,7 @@ _HANG = 20
 class PyBulletViewer(Viewer):
     """PyBullet's window. Closing it ends only the window.
 
-    Raises:
-        DriverMissing: PyBullet is not installed; the world may be another engine's.
-        NotSupported: There is no display to open the window on.
+    Raises DriverMissing without PyBullet (the world may be another engine's), NotSupported without a display.
     """
 
     def __init__(self, host: Host) -> None:

@@ -69,16 +69,9 @@ LEAST_HZ = 100.0
 
 
 class PyBulletWorld(SimulatedWorld[Body]):
-    """One simulation and all bodies in it.
+    """One simulation and all bodies in it; a ``mirror`` is posed by snapshots and never stepped.
 
-    Args:
-        spec: The record of the world.
-        mirror: The world is posed by snapshots and never stepped.
-        gui: Open PyBullet's window, and load what it displays.
-
-    Raises:
-        ConfigError: Something in the record cannot be loaded; lists every problem.
-        DriverMissing: PyBullet is not installed, or its window cannot open.
+    Raises ConfigError with every problem in the record, DriverMissing without PyBullet or where its window cannot open.
     """
 
     ENGINE = "PyBullet"
@@ -166,11 +159,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
             )
 
     def show(self, snapshot: Sequence[float]) -> None:
-        """Place every body as in a snapshot of the same revision.
-
-        Raises:
-            ValueError: It was taken from a world with other bodies.
-        """
+        """Place every body as in a snapshot of the same revision. Raises ValueError for one of other bodies."""
         self._layout.apply(snapshot)
 
     def handle(self, name: str, active: bool) -> None:

@@ -305,7 +305,6 @@ class CameraLink:
 
     @property
     def is_alive(self) -> bool:
-        """Whether the process runs."""
         return self._child.is_alive
 
     @property
@@ -314,16 +313,10 @@ class CameraLink:
         return self._ring.tally
 
     def request(self, method: str, timeout: float, **params: Any) -> Any:
-        """Send a request and return its answer.
+        """Send one of the requests that :mod:`.process` serves, and return its answer.
 
-        Args:
-            method: One of the requests that :mod:`.process` serves.
-            timeout: Time limit, s.
-            params: Arguments of the request.
-
-        Raises:
-            ConnectionLost: If the process has ended, or does not answer in time (it hangs, and must be ended).
-            HalError: The error that the request raised in the process.
+        Raises ConnectionLost if the process has ended, or does not answer within ``timeout`` s (it hangs, and must be
+        ended), and the HalError that the request raised in the process.
         """
         return self._child.request(method, params, timeout)
 
@@ -332,18 +325,10 @@ class CameraLink:
         self._after, self.silence, self.lost = before, 0.0, None
 
     def next_frame(self, timeout: float, every: bool) -> RawFrame | None:
-        """Return the newest frame that was not taken yet.
+        """Return the newest frame that was not taken yet; None if none came within ``timeout`` s.
 
-        Args:
-            timeout: Time to wait for one, s.
-            every: Return every frame in turn instead of the newest. Its time is then the present, because it may have
-                waited in the ring for minutes.
-
-        Returns:
-            The frame; None if none arrived in time.
-
-        Raises:
-            ConnectionLost: If the process has ended.
+        With ``every``, return each frame in turn. Its time is then the present, because it may have waited in the ring
+        for minutes. Raises ConnectionLost if the process has ended.
         """
         deadline = time.monotonic() + timeout
         listened = False

@@ -37,13 +37,7 @@ class RealSenseDevice:
     """
 
     def __init__(self, spec: CameraSpec, ring: FrameRing, notify: Callable[[dict[str, Any]], None]) -> None:
-        """Create the library's context, with the emulated camera in it if the rig selects one.
-
-        Args:
-            spec: The camera's record.
-            ring: Where frames are written to.
-            notify: Called with news (``frame``: a number; ``lost``: a packed error) from the streaming thread.
-        """
+        """Create the context, with the emulated camera in it if the rig selects one; ``notify`` gets the news."""
         self._spec = spec
         self._settings = RealSenseSettings.of(spec)
         self._ring = ring
@@ -82,14 +76,10 @@ class RealSenseDevice:
             again: The camera was open before, so that its exposure has settled.
             first: A recording made now is the first one of the program.
 
-        Returns:
-            The camera's description as plain data: the fields of :class:`~hal.driver.CameraInfo`, ``notes`` (what
-            was changed beyond the rig file), ``before`` (number of the last frame of an earlier session) and
-            ``residual`` (pixels, see :class:`.pipeline.LensModel`).
-
-        Raises:
-            HalError: As :meth:`hal.driver.CameraDriver.open`. A ConnectionLost of a camera that is connected
-                and not in use has the code ``no_frames``.
+        Returns the camera's description as plain data: the fields of :class:`~hal.driver.CameraInfo`, ``notes`` (what
+        was changed beyond the rig file), ``before`` (number of the last frame of an earlier session) and ``residual``
+        (pixels, see :class:`.pipeline.LensModel`). Raises HalError as :meth:`hal.driver.CameraDriver.open`; the
+        ConnectionLost of a camera that is connected and not in use has the code ``no_frames``.
         """
         self.close()
         try:
@@ -183,12 +173,7 @@ class RealSenseDevice:
         return f"{camera} was reset, and will be back in some seconds"
 
     def inject(self, **faults: Any) -> None:
-        """Set faults of an emulated camera (``hal_emulators.realsense.CameraFaults``).
-
-        Raises:
-            NotSupported: For a real camera or a recording.
-            CommandError: For an unknown fault or a wrong value.
-        """
+        """Set faults of an emulated camera. Raises NotSupported for another one, CommandError for a wrong fault."""
         if self._emulated is None:
             raise NotSupported("only an emulated camera takes faults (real: {emulated: true})", code="not_emulated")
         self._emulated.inject(**faults)
@@ -251,18 +236,10 @@ def find_cameras(context: Any) -> list[ConnectedCamera]:
 
 
 def find_camera(context: Any, serial: str | None, name: str = "") -> ConnectedCamera:
-    """Return the camera with a serial number, or the only one that is connected.
+    """Return the camera with a serial number, or the only one that is connected; ``name`` is for the error.
 
     The connected cameras are listed first because the library, if it is to start a camera that is not connected, waits
-    for 15 s.
-
-    Args:
-        context: ``rs2::context``.
-        serial: Serial number; None for the only camera.
-        name: The camera's name in the rig, for the error.
-
-    Raises:
-        DeviceNotFound: If there is no such camera, or several for ``serial=None``; lists those that are connected.
+    for 15 s. Raises DeviceNotFound if there is none, or several for ``serial=None``; lists those that are connected.
     """
     who = f"camera {name}: " if name else ""
     found = find_cameras(context)
@@ -281,11 +258,7 @@ def find_camera(context: Any, serial: str | None, name: str = "") -> ConnectedCa
 
 
 def lock_camera(serial: str) -> DeviceLock:
-    """Lock the camera with that serial number for this process.
-
-    Raises:
-        ControlTaken: If another program has it; names that program's process.
-    """
+    """Lock the camera with that serial number for this process. Raises ControlTaken, naming the other process."""
     return DeviceLock(f"realsense-{serial}", f"camera {serial}")
 
 
@@ -315,25 +288,15 @@ class RecordingFiles:
     """
 
     def __init__(self, path: str, overwrite: bool) -> None:
-        """Create the list of files; nothing is written.
-
-        Args:
-            path: The file of the first recording.
-            overwrite: Whether that file may exist already, and is then deleted.
-        """
         self._path = Path(path)
         self._overwrite = overwrite
         self._locks: dict[Path, DeviceLock] = {}
 
     def next_file(self, first: bool) -> str:
-        """Lock and return the file for a new recording.
+        """Lock and return the file for a new recording; ``first`` is whether it is the program's first.
 
-        Args:
-            first: It is the first recording of the program.
-
-        Raises:
-            NotSupported: If the first file exists and must not be overwritten, or if its folder is missing.
-            ControlTaken: While another camera records to it.
+        Raises NotSupported if the first file exists and must not be overwritten, or if its folder is missing, and
+        ControlTaken while another camera records to it.
         """
         path = self._path
         if not path.parent.is_dir():

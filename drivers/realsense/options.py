@@ -134,11 +134,7 @@ class RealSenseSettings(DeviceSettings):
 
 
 def problems(spec: CameraSpec) -> Iterator[tuple[str, str, str]]:
-    """Check a camera's record.
-
-    Yields:
-        Key in the camera's entry of the rig file (``real.serial``), message and code.
-    """
+    """Yield the problems in a camera's record: key in its entry of the rig file, message and code."""
     settings, found = RealSenseSettings.check(spec)
     yield from found
     if settings is not None and settings.play is not None and not Path(settings.play).is_file():
@@ -202,18 +198,10 @@ def find_sensors(device: Any) -> dict[str, Any]:
 
 
 def apply_options(sensors: Sensors, wanted: Mapping[str, Any]) -> tuple[str, ...]:
-    """Set options and read each one back.
+    """Set options (of :class:`RealSenseSettings`), read each one back, and describe what was changed beyond them.
 
-    Args:
-        sensors: The sensors, as :func:`find_sensors` returns them.
-        wanted: ``options`` of :class:`RealSenseSettings`.
-
-    Returns:
-        Descriptions of what was changed beyond ``wanted``.
-
-    Raises:
-        NotSupported: For an option that the camera lacks (lists those that it has), for a value out of its range, and
-            for one that the camera does not keep.
+    Raises NotSupported for an option that the camera lacks (lists those that it has), for a value out of its range, and
+    for one that the camera does not keep.
     """
     assignments = sorted(_resolve(sensors, wanted), key=lambda one: (*_FIRST, one.name).index(one.name))
     notes = []

@@ -62,18 +62,9 @@ class LivePipeline:
     is_live = True
 
     def __init__(self, context: Any, device: Any, serial: str, profiles: Mapping[str, Any], record: str | None) -> None:
-        """Start streaming.
+        """Start streaming the chosen profiles; ``record`` is a file to record to.
 
-        Args:
-            context: ``rs2::context`` with the camera in it.
-            device: ``rs2::device``
-            serial: Its serial number.
-            profiles: The streams to start, as :func:`choose_profiles` returns them.
-            record: File to record to; None for no recording.
-
-        Raises:
-            ConnectionLost: If the camera does not start (code ``no_frames``).
-            ControlTaken: If another program has the camera.
+        Raises ConnectionLost (code ``no_frames``) if the camera does not start, ControlTaken if another program has it.
         """
         self._device = device
         self._removed = threading.Event()
@@ -114,17 +105,9 @@ class PlaybackPipeline:
     is_live = False
 
     def __init__(self, context: Any, file: str, profiles: Mapping[str, Any], *, repeat: bool, paced: bool) -> None:
-        """Start playing.
+        """Start playing the chosen profiles of a recording. Raises ConnectionLost if it does not start.
 
-        Args:
-            context: ``rs2::context``
-            file: The recording.
-            profiles: The streams to play, as :func:`choose_profiles` returns them.
-            repeat: Whether it starts again at its end.
-            paced: Whether frames come at the rate of the recording; otherwise as fast as they are taken.
-
-        Raises:
-            ConnectionLost: If it does not start.
+        Without ``paced``, frames come as fast as they are taken; with ``repeat``, it starts again at its end.
         """
         self._file = file
         self._repeat = repeat
@@ -184,17 +167,9 @@ def _start(start: Callable[[], Any], what: str, code: str) -> None:
 
 
 def choose_profiles(device: Any, spec: CameraSpec) -> dict[str, Any]:
-    """Return the library's profile for each stream of a camera's record.
+    """Return the library's profile (``rs2::video_stream_profile``) for each stream of a camera's record, by name.
 
-    Args:
-        device: ``rs2::device``
-        spec: The camera's record: size, rate and format of each stream.
-
-    Returns:
-        Stream name -> ``rs2::video_stream_profile``.
-
-    Raises:
-        NotSupported: If the camera lacks a stream or a mode; lists the modes that it has.
+    Raises NotSupported if the camera lacks a stream or a mode; lists the modes that it has.
     """
     profiles = [
         profile.as_video_stream_profile()
@@ -265,15 +240,8 @@ def describe_optics(
 ) -> dict[str, Any]:
     """Return the optical part of a camera's description as plain data.
 
-    Args:
-        spec: The camera's record.
-        device: ``rs2::device``
-        profiles: The running streams, as :func:`choose_profiles` returns them.
-        cropping: Crop and scale of each stream.
-
-    Returns:
-        ``streams``, ``K``, ``distortion``, ``K_infrared`` and ``depth_scale`` of
-        :class:`~hal.driver.CameraInfo`, and ``residual``: the largest of all streams (:class:`LensModel`), pixels.
+    It has ``streams``, ``K``, ``distortion``, ``K_infrared`` and ``depth_scale`` of :class:`~hal.driver.CameraInfo`,
+    and ``residual``: the largest of all streams (:class:`LensModel`), pixels.
     """
     color = profiles.get("color") or _any_color_profile(device)
     streams, lenses = {}, {}

@@ -24,15 +24,7 @@ _REMEDIES: dict[type[HalError], str] = {
 
 
 def preflight(spec: CameraSpec, duration: float) -> Iterator[CheckResult]:
-    """Open the camera, measure its frames, and close it. Nothing is recorded: ``record`` is ignored.
-
-    Args:
-        spec: The camera's record.
-        duration: How long frames are counted, s.
-
-    Yields:
-        One result for the camera, its USB link and its frames each; only the first if it cannot be opened.
-    """
+    """Open the camera, measure its frames for ``duration`` s, and close it. ``record`` is ignored."""
     options = {name: value for name, value in spec.options.items() if name not in ("record", "overwrite")}
     driver = RealSenseCamera(replace(spec, options=options))
     try:

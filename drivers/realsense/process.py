@@ -35,13 +35,7 @@ _TAKEN = 5.0
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
-    """Serve one camera until the app closes it or ends.
-
-    Args:
-        channel: Requests and answers.
-        memories: The memory of the frame ring.
-        config: ``spec``: the camera's record, as JSON.
-    """
+    """Serve one camera, whose record is in ``config``, until the app closes it or ends; frames go into the memory."""
     yield_to_others(_NICE)
     spec = from_json(CameraSpec, config["spec"])
     device = RealSenseDevice(spec, FrameRing(memories[0].buffer, spec), partial(_notify, channel))

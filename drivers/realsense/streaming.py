@@ -106,16 +106,10 @@ class CaptureTimes:
         self._last = float("-inf")
 
     def __call__(self, stamp: float, domain: str, arrival: float, wall: float) -> tuple[float, float]:
-        """Return the time of a capture.
+        """Return the time of a capture on the monotonic clock, and its stamp without the clock's wrap, s.
 
-        Args:
-            stamp: The frame's stamp, s.
-            domain: The clock of the stamp: ``hardware``, ``global`` or ``system``.
-            arrival: When the frame arrived, on the monotonic clock, s.
-            wall: The time of day at that moment, s.
-
-        Returns:
-            Time of capture on the monotonic clock, and the device's own stamp without its wrap, s.
+        ``arrival`` (monotonic clock, s) and ``wall`` (time of day, s) are when the frame arrived; ``domain`` is the
+        clock of the stamp: ``hardware``, ``global`` or ``system``.
         """
         if domain == HARDWARE:
             stamp = self._unwrap(stamp)
@@ -224,10 +218,6 @@ class FrameConverter:
 
     Copies, for each stream: alignment makes an image of its own (in the library, of depth or of colour), and the result
     is written once, into the memory in which it travels. A crop that scales makes one more, of the smaller image.
-
-    Args:
-        spec: The camera's record.
-        profiles: Stream name -> ``rs2::video_stream_profile``.
     """
 
     def __init__(self, spec: CameraSpec, profiles: Mapping[str, Any]) -> None:
@@ -269,13 +259,7 @@ class FrameConverter:
         return found
 
     def convert(self, frames: Any, single: Mapping[str, Any], into: Images) -> None:
-        """Write the images of a frame set.
-
-        Args:
-            frames: ``rs2::frameset``
-            single: Its frames, as :meth:`split` returned them.
-            into: Arrays to write to, one for each stream.
-        """
+        """Write the images of a frame set; ``single`` are its frames, as :meth:`split` returned them."""
         found = dict(single)
         if self._decoder is not None and self._to_depth:
             frames = self._decoder.process(frames).as_frameset()  # only RGB can be aligned
@@ -376,10 +360,6 @@ class FrameStreamer:
         """Start the thread.
 
         Args:
-            spec: The camera's record.
-            profiles: Stream name -> ``rs2::video_stream_profile``.
-            pipeline: Where frame sets come from.
-            ring: Where captures are written to.
             notify: Called from the thread with news: ``frame`` (number of the newest capture in the ring; 0 for none)
                 and ``lost`` (the packed ConnectionLost).
             stall: Time without a new capture after which the camera is lost, s.
@@ -414,7 +394,6 @@ class FrameStreamer:
 
     @property
     def cropping(self) -> Mapping[str, Cropping]:
-        """Crop and scale of each stream."""
         return self._converter.cropping
 
     def wait_for_start(self, timeout: float) -> StreamStart | None:

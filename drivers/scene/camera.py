@@ -100,16 +100,8 @@ class SimulatedCamera(CameraDriver):
 class DirectSource:
     """Source in lock-step: draws the present state of the world in the caller's thread, each state once.
 
-    A camera with a latency draws the state that the world had before.
-
-    Args:
-        mirror: What is drawn of the world.
-        renderer: Draws it.
-        spec: The camera.
-        now: The clock of the rig.
-
-    Raises:
-        ConfigError: The camera has no place in the world.
+    A camera with a latency draws the state that the world had before. Raises ConfigError if it has no place in the
+    world.
     """
 
     def __init__(self, mirror: LocalMirror, renderer: Renderer, spec: CameraSpec, now: Callable[[], float]) -> None:
@@ -135,11 +127,9 @@ class DirectSource:
 
 
 class SharedSource:
-    """Source in real time: the newest picture of the process that draws.
+    """Source in real time: the newest picture of the process that draws, in the ring.
 
-    Args:
-        ring: Where that process puts the camera's pictures.
-        check: Raises ConnectionLost when that process has ended.
+    ``check`` raises ConnectionLost when that process has ended.
     """
 
     def __init__(self, ring: FrameRing, check: Callable[[], None]) -> None:
@@ -217,15 +207,7 @@ class SimulatedPictures(CameraRenderer):
 
 
 class RenderWorker:
-    """Draws each camera's picture at its rate, staggered, whenever the world has changed since the last one.
-
-    Args:
-        drawn: What is drawn.
-        mirror: Poses it.
-        renderer: Draws it.
-        cameras: Records of the cameras.
-        rings: Where the pictures of each camera go.
-    """
+    """Draws each camera's picture at its rate, staggered, whenever the world has changed since the last one."""
 
     def __init__(
         self,
@@ -317,11 +299,8 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
 def choose_renderer(scene: RenderScene, name: str = "auto") -> Renderer:
     """Return the renderer ``gl`` or ``tiny``, or with ``auto`` the first of them that works on this machine.
 
-    Its ``description`` has the reason why ``gl`` was not chosen, and the remedy.
-
-    Raises:
-        ConfigError: No renderer of that name.
-        DriverMissing: The one that was required by name, or each of them, is not available.
+    Its ``description`` has the reason why ``gl`` was not chosen, and the remedy. Raises ConfigError for another name,
+    and DriverMissing if the one that was named, or each of them, is not available.
     """
     if name not in ("auto", "gl", "tiny"):
         message = f"is {name!r}; renderers: auto, gl, tiny"

@@ -119,11 +119,7 @@ def _read_options(spec: CameraSpec, problems: Problems) -> NoiseOptions | None:
 
 
 class DepthNoise:
-    """Turns exact depth into measured depth: common part of all kinds of sensors.
-
-    Raises:
-        ConfigError: The options are wrong.
-    """
+    """Turns exact depth into measured depth: common part of all kinds of sensors. Raises ConfigError."""
 
     def __init__(self, spec: CameraSpec, noise: NoiseOptions) -> None:
         assert spec.depth_sensor is not None  # checked by noise_of
@@ -132,12 +128,7 @@ class DepthNoise:
         self._seed = noise.seed, zlib.crc32(spec.name.encode())
 
     def __call__(self, depth: Image, number: int) -> Image:
-        """Return the measured depth of a frame.
-
-        Args:
-            depth: (H, W) m; 0 where there is none. It may be changed.
-            number: Number of the frame.
-        """
+        """Return the measured depth (H, W), m, of a frame by its number; 0 for none. ``depth`` may be changed."""
         raise NotImplementedError
 
     def _generator(self, number: int) -> np.random.Generator:
@@ -189,11 +180,9 @@ class _StereoNoise(DepthNoise):
 
 
 class _Imager:
-    """One of the two imagers, and what it sees of the picture that is handed out.
+    """One of the two imagers, ``baseline`` m apart, and what it sees of the picture that is handed out.
 
-    Args:
-        offset: Its position in the frame of the picture that is handed out, (3,) m; their axes are parallel.
-        baseline: Distance between the two imagers, m.
+    ``offset`` (3,), m, is its position in the frame of that picture; their axes are parallel.
     """
 
     def __init__(self, spec: CameraSpec, sensor: SensorSpec, offset: NDArray[np.float64], baseline: float) -> None:

@@ -124,8 +124,7 @@ class Disturbances:
     def measure(self, *parts: Any) -> tuple[float, tuple[Any, ...]]:
         """Return what the device reports now of a measurement: its time, s of the world, and its parts.
 
-        Args:
-            *parts: Numbers or sequences of them, in the order of the keys of the noise; further ones have none.
+        The parts are numbers or sequences of them, in the order of the keys of the noise; further ones have none.
         """
         if not self.active:
             return self._world.t, parts

@@ -64,13 +64,8 @@ class DrawnBody:
 class DrawnWorld:
     """All bodies of a world, at the poses of the newest snapshot; a :class:`.shapes.RenderScene`.
 
-    Before the first snapshot, and after an edit, bodies are at their initial poses.
-
-    Args:
-        spec: Record of the world.
-
-    Raises:
-        ConfigError: A file in the record is missing or broken; lists every problem.
+    Before the first snapshot, and after an edit, bodies are at their initial poses. Raises ConfigError with every
+    problem.
     """
 
     def __init__(self, spec: WorldSpec) -> None:
@@ -142,11 +137,7 @@ class DrawnWorld:
     # --- snapshots ---------------------------------------------------------------------------------------------------
 
     def show(self, snapshot: Sequence[float]) -> None:
-        """Place every body as in a snapshot of the same revision.
-
-        Raises:
-            ValueError: It was taken from a world with other bodies.
-        """
+        """Place every body as in a snapshot of the same revision. Raises ValueError for one of other bodies."""
         values = np.asarray(snapshot, float)
         if len(values) != self._size:
             raise ValueError(f"a snapshot of {len(values)} numbers does not fit a world of {self._size}")
@@ -292,8 +283,7 @@ class DrawnWorld:
     def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
         """Return ``position`` (3,) m and ``orientation`` (4,) xyzw of a link, of the base for None.
 
-        Raises:
-            DeviceNotFound: No such body or link; lists the existing ones.
+        Raises DeviceNotFound, which lists the existing bodies or links.
         """
         if name not in self.bodies:
             raise DeviceNotFound(f"the world has no body {name!r}{nearest(name, self.bodies)}", code="unknown_body")

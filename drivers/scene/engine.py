@@ -124,8 +124,7 @@ class SceneEngine(WorldDriver, Generic[B]):
     def load_body(self, spec: BodySpec | RobotSpec) -> B:
         """Load a body, whose name is new, into the engine. It need not stand at its initial pose yet.
 
-        Raises:
-            ConfigError: It cannot be loaded; nothing of it stays. Lists all problems.
+        Raises ConfigError with all problems if it cannot be loaded; nothing of it stays.
         """
 
     @abstractmethod
@@ -229,8 +228,7 @@ class SceneEngine(WorldDriver, Generic[B]):
     def restore_engine(self, state: Any) -> None:
         """Put the engine into a state of :meth:`save_engine`, of a world with the same bodies.
 
-        Raises:
-            ValueError: It is no such state; nothing changes.
+        Raises ValueError if it is no such state; nothing changes.
         """
         raise NotSupported(f"{self.ENGINE} does not restore states", code="no_states")
 

@@ -51,14 +51,11 @@ class _Shot(NamedTuple):
 
 
 class Exposure:
-    """Makes the frames of one camera.
+    """Makes the frames of one camera. Raises ConfigError for wrong noise options.
 
     Colour, depth and segmentation share one view, which is that of colour or depth. Each infrared picture has a view of
     its own, and costs another drawing, unless the views are the same. A randomization of the world changes them; its
     noise is that of its seed and of the number of frames since.
-
-    Raises:
-        ConfigError: The noise options are wrong.
     """
 
     def __init__(self, spec: CameraSpec) -> None:
@@ -89,14 +86,9 @@ class Exposure:
         self._main = _Shot(replace(spec, streams=streams), self._T_color) if streams else None
 
     def capture(self, world: PosedWorld, renderer: Renderer, t: float, t_device: float, number: int) -> RawFrame:
-        """Draw a frame of the present state of the world.
+        """Draw a frame of the present state of the world; its number also selects its noise.
 
-        Args:
-            world: The world that ``renderer`` draws.
-            renderer: Draws the pictures.
-            t: Stamp of the frame, s on the clock of the rig.
-            t_device: Stamp of the frame, s on the clock of the world.
-            number: Number of the frame, which also selects its noise.
+        ``t`` and ``t_device`` are its stamps, s on the clocks of the rig and of the world.
         """
         if world.randomized is not self.randomized:
             self._prepare(world.randomized)
@@ -130,11 +122,8 @@ class PictureNoise:
     """Normal noise of pictures; of depth it grows with the square of the distance, as that of stereo cameras does.
 
     Drawing a number for each pixel would take longer than drawing the picture: the noise is a part of one long
-    sequence, which begins elsewhere for each picture.
-
-    Args:
-        light: Standard deviation of colour and infrared, as a share of white.
-        depth: That of depth at 1 m, m.
+    sequence, which begins elsewhere for each picture. ``light`` is the standard deviation of colour and infrared, as a
+    share of white, ``depth`` that of depth at 1 m, m.
     """
 
     def __init__(self, light: float, depth: float) -> None:

@@ -34,15 +34,10 @@ def movable_joints(body: SimulatedBody) -> dict[str, BodyJoint]:
 
 
 def joints_to_place(body: SimulatedBody, positions: Mapping[str, float]) -> dict[int, float]:
-    """Return joint number -> position for some joints of an object, and for those that follow them.
+    """Return joint number -> position, rad or m, for some joints of an object, and for those that follow them.
 
-    Args:
-        body: The object.
-        positions: Position by the name of the joint, rad or m.
-
-    Raises:
-        DeviceNotFound: No such joint; lists the existing ones.
-        CommandError: No such numbers, outside of a joint's range, or of a joint that follows another one.
+    Raises DeviceNotFound, which lists the joints, and CommandError for a position out of range, for what is no number,
+    and for a joint that follows another one.
     """
     joints = movable_joints(body)
     if not isinstance(positions, Mapping):

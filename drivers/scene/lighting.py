@@ -97,14 +97,10 @@ class ShadowMap:
             self._array = self._context.vertex_array(self._program, [(vertices, "3f4", "position")], indices)
 
     def draw(self, direction: Array, frames: Array) -> Array:
-        """Draw the depths, unless they are those that were drawn last.
+        """Draw the depths, unless they are those that were drawn last; return the matrix (4, 4), world to map, 0..1.
 
-        Args:
-            direction: (3,) unit vector towards the light, in the world.
-            frames: Poses (N, 4, 4) of all links in the world.
-
-        Returns:
-            The matrix (4, 4) from the world to the map, 0..1.
+        ``direction`` (3,) is a unit vector towards the light, ``frames`` the poses (N, 4, 4) of all links, in the
+        world.
         """
         key = direction.tobytes(), frames.tobytes()
         if key == self._shown:

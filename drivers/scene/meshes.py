@@ -54,12 +54,7 @@ def cache_folder() -> Path:
 
 
 class MeshLibrary:
-    """Meshes by file, from memory, from the cache folder or parsed, in this order.
-
-    Args:
-        folder: The cache folder; None for :func:`cache_folder`.
-        parser: Parses a file; None for :func:`parse`.
-    """
+    """Meshes by file, from memory, from the cache folder or parsed, in this order."""
 
     def __init__(self, folder: Path | None = None, parser: Callable[[str], list[Mesh]] | None = None) -> None:
         self._folder = cache_folder() if folder is None else folder
@@ -145,16 +140,9 @@ def _read_mesh(archive: Any, name: str) -> Mesh:
 
 
 def parse(path: str) -> list[Mesh]:
-    """Parse a mesh file.
+    """Parse a mesh file of any format that trimesh reads. Raises ValueError if it has no triangles.
 
-    Args:
-        path: A file in any format that trimesh reads.
-
-    Returns:
-        One mesh per texture, in m, with the colours of the file's materials.
-
-    Raises:
-        ValueError: The file has no triangles.
+    Returns one mesh per texture, in m, with the colours of the file's materials.
     """
     import trimesh  # half a second, and not needed when everything is in the cache
 

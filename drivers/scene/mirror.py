@@ -28,12 +28,7 @@ class MirrorWorld(Protocol):
 
 
 class WorldMirror:
-    """Poses a copy of the world by the snapshots and the edits of the world that is stepped in another process.
-
-    Args:
-        world: The copy.
-        snapshots: Where the stepped world's process publishes its snapshots.
-    """
+    """Poses a copy of the world by the snapshots and the edits of the world that is stepped in another process."""
 
     def __init__(self, world: MirrorWorld, snapshots: SeriesBox) -> None:
         self._world = world
@@ -47,11 +42,10 @@ class WorldMirror:
         self._edits[revision] = (method, params)
 
     def update(self) -> float | None:
-        """Show the newest snapshot.
+        """Show the newest snapshot, and return its time, s.
 
-        Returns:
-            Its time, s. None before the first one, and while an edit that it includes has not arrived: snapshots come
-            through memory and may overtake edits, which come through a socket.
+        Returns None before the first one, and while an edit that it includes has not arrived: snapshots come through
+        memory and may overtake edits, which come through a socket.
         """
         record = self._snapshots.read()
         if record is None:
@@ -71,11 +65,7 @@ class WorldMirror:
 
 
 class LocalMirror:
-    """What is drawn of a world that is stepped in this process.
-
-    Args:
-        world: The world, before its first edit.
-    """
+    """What is drawn of a world that is stepped in this process, which has not been edited yet."""
 
     def __init__(self, world: SimulatedWorld[Any]) -> None:
         self.world = world

@@ -31,8 +31,7 @@ UNKNOWN_SPEED = 2.0
 def primitive_size(spec: BodySpec) -> tuple[float, ...]:
     """Return the size of a primitive shape, m: half extents of a box, radius, or radius and length; a plane has none.
 
-    Raises:
-        ConfigError: The record lacks it, or there is no such shape.
+    Raises ConfigError if the record lacks it, or there is no such shape.
     """
     if spec.shape not in _PRIMITIVES:
         message = f"is {spec.shape!r}; shapes: {', '.join(_PRIMITIVES)}, mesh, urdf"
@@ -46,11 +45,7 @@ def primitive_size(spec: BodySpec) -> tuple[float, ...]:
 
 
 def hulls_of(spec: BodySpec) -> tuple[Hull, ...]:
-    """Return the hulls that collide of an object of the shape ``mesh``.
-
-    Raises:
-        ConfigError: Its file is missing, or cannot be one; names the file.
-    """
+    """Return the hulls that collide of an object of the shape ``mesh``. Raises ConfigError, which names the file."""
     key = f"objects.{spec.name}.mesh"
     if spec.mesh is None:
         raise ConfigError([Problem("objects", key, "is missing, and the shape is mesh", "missing_key")])
@@ -99,12 +94,9 @@ class JointDrives:
 
 
 def joint_drives(spec: RobotSpec, limits: Mapping[str, tuple[float, float]], urdf: UrdfModel) -> JointDrives:
-    """Return the drives of an arm's movable joints.
+    """Return the drives of an arm's movable joints. Joints that follow others by a ``<mimic>`` have no motor.
 
-    Args:
-        spec: The arm's record, whose own limits of effort and speed win.
-        limits: Effort and speed of every movable joint in the URDF, 0 if unknown.
-        urdf: The arm's URDF. Joints that follow others by a ``<mimic>`` have no motor and start where they follow to.
+    ``limits`` are effort and speed of every movable joint in the URDF, 0 if unknown; the record's own win.
     """
     drives = JointDrives()
     fingers = spec.gripper.joints if spec.gripper else ()

@@ -107,17 +107,11 @@ class _Body(NamedTuple):
 
 
 class GLRenderer(Renderer):
-    """Draws with moderngl on EGL.
+    """Draws with moderngl on EGL; without a ``library``, meshes come from one with the user's cache.
 
     The shader writes depth in metres, so it is as exact as a float and needs no conversion. The picture is drawn with
-    its first row first, so nothing is flipped either.
-
-    Args:
-        scene: What is drawn.
-        library: Where its meshes come from; None for one with the user's cache.
-
-    Raises:
-        DriverMissing: moderngl, EGL or a graphics driver is missing; names the command that installs it.
+    its first row first, so nothing is flipped either. Raises DriverMissing if moderngl, EGL or a graphics driver is
+    missing; names the command that installs it.
     """
 
     def __init__(self, scene: RenderScene, library: MeshLibrary | None = None) -> None:

@@ -187,15 +187,11 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         self._connected, self._freeze, self._fault, self._away = True, False, None, None
 
     def inject(self, **faults: object) -> None:
-        """Switch injected faults on or off.
+        """Switch injected faults on or off. Raises CommandError for another one.
 
-        Args:
-            **faults: ``freeze=True``: every reading repeats the last one, including its stamps. ``disconnect=True``:
-                the robot does not answer. ``fault="text"``: the robot reports that fault, holds its position and
-                ignores set-points; ``fault=None`` ends it.
-
-        Raises:
-            CommandError: No such fault.
+        ``freeze=True``: every reading repeats the last one, including its stamps. ``disconnect=True``: the robot does
+        not answer. ``fault="text"``: the robot reports that fault, holds its position and ignores set-points;
+        ``fault=None`` ends it.
         """
         known = {"freeze", "disconnect", "fault"}
         if not set(faults) <= known:

@@ -139,12 +139,7 @@ class Mesh:
         )
 
     def covered(self, texture: NDArray[np.uint8], side: float) -> Mesh:
-        """Return the mesh without colours of its own, covered with a picture from six sides.
-
-        Args:
-            texture: (H, W, 3) RGB.
-            side: Width and height of the picture on the surface, m.
-        """
+        """Return the mesh, covered with a picture (H, W, 3) RGB, ``side`` m wide, from six sides."""
         corners = self.positions[self.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         axis = np.abs(across).argmax(axis=1)
@@ -319,13 +314,7 @@ class DrawnPart:
 
 
 def parts_of(body: int, visuals: Sequence[Visual], load_mesh: Callable[[str], Sequence[Mesh]]) -> list[DrawnPart]:
-    """Return the parts of one body.
-
-    Args:
-        body: The body's id.
-        visuals: Its visual shapes.
-        load_mesh: Returns the meshes in a file, for example :meth:`.meshes.MeshLibrary.load`.
-    """
+    """Return the parts of one body by its id; ``load_mesh`` returns the meshes in a file."""
     found: list[tuple[Visual, Array, Mesh]] = []
     for visual in visuals:
         if visual.rgba[3] != 0:

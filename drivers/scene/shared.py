@@ -53,19 +53,11 @@ class Connection:
 
     @classmethod
     def connect(cls, address: str, timeout: float, **greeting: Any) -> tuple[Connection, Any]:
-        """Connect, and say what for.
+        """Connect, say what for, and return the connection with the program's answer.
 
-        Args:
-            address: Of the world.
-            timeout: Longest wait for an answer, now and later, s.
-            **greeting: ``role``, and what the program has to know of a client of this kind.
-
-        Returns:
-            The connection, and the program's answer.
-
-        Raises:
-            ConnectionLost: There is no such program, or it does not answer.
-            HalError: It refuses this client, with its reason.
+        ``timeout`` is the longest wait for an answer, now and later, s. The greeting has a ``role``, and what the
+        program has to know of a client of this kind. Raises ConnectionLost if there is no such program, or it does not
+        answer, and the HalError with which it refuses this client.
         """
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         sock.settimeout(timeout)
@@ -130,10 +122,8 @@ class SharedWorld(WorldDriver):
     def __init__(self, spec: WorldSpec, address: str) -> None:
         """Join the world.
 
-        Raises:
-            ConnectionLost: No emulator shares a world.
-            ControlTaken: Another program has it.
-            ConfigError: Its scene is another one.
+        Raises ConnectionLost if no emulator shares one, ControlTaken if another program has it, ConfigError for another
+        scene.
         """
         super().__init__(spec)
         self._address = address

@@ -22,16 +22,9 @@ HOLLOW, SLICES = 0.5, 10
 
 
 def checked_urdf(path: str, key: str) -> UrdfModel:
-    """Read and check a URDF and its meshes.
+    """Read and check a URDF and its meshes. A visual mesh in a package that is not installed is no problem.
 
-    A visual mesh in a package that is not installed is no problem: see :func:`drawn_visuals`.
-
-    Args:
-        path: The file.
-        key: The configuration key that names it.
-
-    Raises:
-        ConfigError: The file or a mesh is missing or broken; lists all problems.
+    Raises ConfigError with all problems of the file that the configuration's ``key`` names, and of its meshes.
     """
     try:
         model = read_urdf(Path(path))
@@ -144,12 +137,9 @@ def _absent(name: str) -> str:
 def mesh_points(shape: UrdfVisual, *, sliced: bool = False) -> Iterator[NDArray[np.float64]]:
     """Yield the points (n, 3), m, of each part of a link's mesh that collides with a hull of its own.
 
-    Args:
-        shape: The mesh. The parts of an OBJ are its objects and groups, as in PyBullet; others have one part.
-        sliced: Cut a part that fills less than half of its hull, as a bent finger does, across its longest side.
-
-    Raises:
-        ValueError: The mesh cannot be read, or a part of it is flat.
+    The parts of an OBJ are its objects and groups, as in PyBullet; others have one part. With ``sliced``, cut a part
+    that fills less than half of its hull, as a bent finger does, across its longest side. Raises ValueError if the mesh
+    cannot be read, or a part of it is flat.
     """
     file = Path(shape.file)
     scale = np.array(shape.size)

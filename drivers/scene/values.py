@@ -53,8 +53,7 @@ def numbers(name: str, values: Any, size: int | None = None) -> list[float]:
 def transform(pose: object) -> Transform:
     """Return the transform of a pose ``{"position": (3,), "orientation": (4,) xyzw}``; the orientation is optional.
 
-    Raises:
-        CommandError: It is no such pose, or its orientation is zero.
+    Raises CommandError if it is no such pose, or its orientation is zero.
     """
     if not isinstance(pose, Mapping) or not set(pose) <= {"position", "orientation"} or "position" not in pose:
         raise CommandError(f"a pose is {{'position': [x, y, z], 'orientation': [x, y, z, w]}}, not {pose!r}")
@@ -146,18 +145,11 @@ def dynamics_values(body: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def completed_dynamics(body: str, wanted: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all properties that a change of some of them sets.
+    """Return all properties that a change of some of them, as of :func:`dynamics_values`, sets.
 
     A new mass scales the inertia with it unless an inertia is given. The stiffness and the damping of contacts are set
-    together: where only one is given, the other one stays.
-
-    Args:
-        body: Name of the body.
-        wanted: The given properties, as of :func:`dynamics_values`.
-        before: The link's present properties.
-
-    Raises:
-        CommandError: A mass that would make a fixed body movable or the reverse, or contacts half hard and half soft.
+    together: where only one is given, the other one stays. Raises CommandError for a mass that would make a fixed body
+    movable or the reverse, and for contacts half hard and half soft.
     """
     wanted = dict(wanted)
     if "mass" in wanted:

@@ -429,13 +429,9 @@ class SimulatedWorld(SceneEngine[B]):
         """Reset one body, or all, at rest, to their initial state in the rig or to these arguments.
 
         An arm holds its position and its gripper is open. The mirror of a real arm stays where that arm is. Added and
-        removed bodies, colours and dynamics are kept, and simulated time continues.
-
-        Args:
-            name: The body; None for all.
-            pose: Pose of an object's base link in the world; only with a name.
-            q: Joint positions, rad or m; only with a name. For an arm, those of its joints, or of its joints and
-                fingers; for an object, those of all its movable joints.
+        removed bodies, colours and dynamics are kept, and simulated time continues. ``pose`` is that of an object's
+        base link in the world; ``q`` are positions, rad or m, of an arm's joints, or of its joints and fingers, or of
+        all movable joints of an object.
         """
         self.began_at = self.steps
         if name is None:

@@ -56,14 +56,7 @@ def probe(host: str) -> str:
 
 
 class UrLink(LibraryThread):
-    """A connection: ``ready`` is whether the control program runs.
-
-    Args:
-        name: The arm's name.
-        settings: Its settings.
-        rate_hz: Rate of states and set-points.
-        tcp: The tcp in the frame of the flange (m, rotation vector in rad); None to leave the installation's.
-    """
+    """A connection: ``ready`` is whether the control program runs. Without a ``tcp`` the installation's stays."""
 
     LIBRARY: ClassVar[str] = "ur_rtde"
     NOT_STARTED: ClassVar[Fault] = NOT_STARTED

@@ -41,15 +41,7 @@ _PRIMARY = 30001
 
 
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
-    """Check one arm.
-
-    Args:
-        spec: The arm in the rig.
-        duration: Time for measuring its states, s.
-
-    Yields:
-        One result per check.
-    """
+    """Check one arm; measure its states for ``duration`` s."""
     settings = UrSettings.of(spec)
     why = probe(settings.host)
     if why:

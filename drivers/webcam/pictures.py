@@ -19,14 +19,10 @@ from .settings import FORMATS
 
 
 class PictureDecoder:
-    """Decodes the frames of one format.
+    """Decodes the frames of one of :data:`.settings.FORMATS`.
 
-    Args:
-        name: One of :data:`.settings.FORMATS`.
-        width: Width of the frames, pixels.
-        height: Height, pixels.
-        matrix: ``ITU601`` or ``ITU709``: how colours are encoded in formats that do not say it themselves.
-        full: Whether their values use the full range of 0..255.
+    ``matrix`` (``ITU601`` or ``ITU709``) is how colours are encoded in formats that do not say it themselves, ``full``
+    whether their values use the full range of 0..255.
     """
 
     def __init__(self, name: str, width: int, height: int, matrix: str = "ITU601", full: bool = False) -> None:
@@ -69,15 +65,7 @@ def to_rgb(frame: Any, **how: str) -> NDArray[np.uint8]:
 
 
 class PictureOutput:
-    """Makes the images of a camera's frames from those that it captures.
-
-    Args:
-        spec: The camera's record.
-        undistort: Whether to remove the lens distortion.
-
-    Raises:
-        DriverMissing: OpenCV, which undistorts, is not installed.
-    """
+    """Makes the images of a camera's frames from those that it captures. Raises DriverMissing without OpenCV."""
 
     def __init__(self, spec: CameraSpec, undistort: bool) -> None:
         width, height = spec.capture_width, spec.capture_height

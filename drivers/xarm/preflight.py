@@ -27,15 +27,7 @@ _FIRST = 1.0
 
 
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
-    """Check one arm.
-
-    Args:
-        spec: The arm in the rig.
-        duration: Time for measuring its reports, s.
-
-    Yields:
-        One result per check.
-    """
+    """Check one arm; measure its reports for ``duration`` s."""
     settings = XArmSettings.of(spec)
     host, line, api, lock = settings.host, ReportLine(spec.name, settings.host), None, None
     try:

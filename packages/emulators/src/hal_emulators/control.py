@@ -42,14 +42,9 @@ def run_emulator(
     arguments: Sequence[str] | None,
     start: Callable[[argparse.Namespace, contextlib.ExitStack], Started],
 ) -> int:
-    """Run an emulator of every device of its kind in a rig until it is asked to end, and return its exit status.
+    """Run an emulator of every device of its kind in a rig until it is asked to end; return its exit status.
 
-    Args:
-        kind: Its name for ``hal emulate``.
-        description: What it plays; what it proves is added.
-        commands: Help on its commands.
-        arguments: The command line; None for that of this program.
-        start: Starts it, for these options; the stack is closed at the end.
+    ``description`` is what it plays; what it proves is added. ``start`` starts it; the stack is closed at the end.
     """
     parser = make_parser(kind, description, commands, "; with several devices, the arm's name first")
     _add_rig_options(parser)
@@ -115,12 +110,8 @@ class EmulatorControl:
     def send(self, *words: object) -> dict[str, Any]:
         """Execute one command, given as one text or as words: ``send("silence 0.5")``, ``send("silence", 0.5)``.
 
-        Returns:
-            The answer; empty after ``kill``.
-
-        Raises:
-            ValueError: With the emulator's message, if it refuses the command.
-            ConnectionError: If the emulator has ended.
+        Returns the answer, which is empty after ``kill``. Raises ValueError with the emulator's message if it refuses
+        the command, ConnectionError if the emulator has ended.
         """
         command = " ".join(str(word) for word in words).split()
         if not command:
@@ -140,7 +131,6 @@ class EmulatorControl:
         return answer
 
     def close(self) -> None:
-        """Disconnect."""
         self._reader.close()
         self._socket.close()
 
@@ -170,11 +160,7 @@ def serve_prompt(execute: Execute) -> None:
 
 
 class CommandPort:
-    """The control port: TCP on this computer, one thread for each client.
-
-    Attributes:
-        number: The port.
-    """
+    """The control port: TCP on this computer, one thread for each client. Its ``number`` is the port."""
 
     def __init__(self, execute: Execute, number: int = 0, host: str = "127.0.0.1") -> None:
         """Listen on a port, 0 for a free one. Raises OSError if it is taken."""
@@ -195,7 +181,6 @@ class CommandPort:
                 connection.sendall(json.dumps(answer_line(self._execute, line)).encode() + b"\n")
 
     def close(self) -> None:
-        """Close the port."""
         self._listener.close()
 
 

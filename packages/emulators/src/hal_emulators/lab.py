@@ -26,8 +26,6 @@ _FRANKA = {"fr3": "fr3", "fer": "panda"}
 
 
 class Emulator(NamedTuple):
-    """An emulator of a rig."""
-
     name: str
     """At the prompt: that of the arm, or of the program that plays several."""
     arguments: list[str]
@@ -35,15 +33,10 @@ class Emulator(NamedTuple):
 
 
 def list_emulators(config: str, overrides: Sequence[str] = ()) -> list[Emulator]:
-    """Return the emulators of a rig.
+    """Return the emulators of a rig (a name in ``config/``, or a path), with changes ``KEY=VALUE``.
 
-    Args:
-        config: The rig: a name in ``config/``, or a path.
-        overrides: Changes to it, ``KEY=VALUE``.
-
-    Raises:
-        ConfigError: The rig is not valid.
-        ValueError: A device is not at an address of this computer, a UR's model has no emulator, or nothing is real.
+    Raises ConfigError, and ValueError if a device is not at an address of this computer, a UR's model has no emulator,
+    or nothing is real.
     """
     rig = load_real(config, overrides)
     words = ["--config", config, *(word for value in overrides for word in ("--set", value))]
@@ -91,10 +84,8 @@ def _emulator_of(driver: str, arm: RobotSpec, words: list[str], in_world: bool) 
 def run_lab(config: str, overrides: Sequence[str] = ()) -> int:
     """Run the emulators of a rig until one ends or the program is asked to end; return the exit status.
 
-    A line of standard input goes to the emulator whose name it begins with, or to the only one.
-
-    Raises:
-        ConfigError, ValueError: As :func:`list_emulators`.
+    A line of standard input goes to the emulator whose name it begins with, or to the only one. Raises as
+    :func:`list_emulators`.
     """
     ends = note_signals()
     emulators = list_emulators(config, overrides)

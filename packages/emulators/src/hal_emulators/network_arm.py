@@ -34,11 +34,7 @@ from .shared_world import PRIORITY, ArmInWorld, enter_world, find_arm, raise_pri
 
 
 class NetworkController:
-    """A controller with its arm.
-
-    Args:
-        dt: Its cycle, s.
-    """
+    """A controller with its arm and a cycle of ``dt`` s."""
 
     def __init__(self, dt: float) -> None:
         self.dt, self.now = dt, 0.0
@@ -69,15 +65,8 @@ class Client:
 class NetworkArm:
     """A controller's ports on one address, served by one thread, once per cycle of the controller.
 
-    The control port is one of them: a ``CommandPort``'s threads would change the controller within a cycle.
-
-    Args:
-        host: Address to listen on.
-        controller: The controller.
-        seed: Of the losses.
-
-    Raises:
-        OSError: If a port is in use, or below 1024 and not allowed.
+    The control port is one of them: a ``CommandPort``'s threads would change the controller within a cycle. Raises
+    OSError if a port is in use, or below 1024 and not allowed.
     """
 
     PORTS: ClassVar[tuple[int, ...]]
@@ -117,7 +106,6 @@ class NetworkArm:
         self._listeners = [self._listen(port) for port in self.PORTS]
 
     def run(self, ends: Sequence[object]) -> None:
-        """Serve until something is in ``ends``."""
         raise_priority(PRIORITY)
         due = time.monotonic()
         while not ends:
@@ -136,7 +124,6 @@ class NetworkArm:
                 self.publish()
 
     def close(self) -> None:
-        """Close all sockets."""
         for key in list(self._selector.get_map().values()):
             key.fileobj.close()  # type: ignore[union-attr]
         self._selector.close()
@@ -197,7 +184,6 @@ class NetworkArm:
             self.greet(client)
 
     def drop(self, client: Client) -> None:
-        """Hang up."""
         if client in self.clients:
             self.clients.remove(client)
             self._selector.unregister(client.line)
@@ -295,14 +281,10 @@ def run_program(
     create: Callable[[argparse.Namespace], NetworkArm],
     describe: Callable[[NetworkArm], str],
 ) -> int:
-    """Run the program of an emulator, and return its exit status.
+    """Run the program of an emulator of this driver; return its exit status.
 
-    Args:
-        parser: With the options of this emulator.
-        arguments: Of the command line.
-        driver: Name of the driver.
-        create: Returns the emulator for the options.
-        describe: Returns what it is and its ports, for the reader.
+    ``create`` returns the emulator for the options of ``parser``, ``describe`` what it is and its ports, for the
+    reader.
     """
     add = parser.add_argument
     add("--host", default="127.0.0.1", type=read_loopback, help="address to listen on, at fixed ports (%(default)s)")

@@ -29,7 +29,6 @@ DEVICES = {
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the command line."""
     devices = "\n".join(f"  {name:9s} {what}" for name, what in DEVICES.items())
     made = argparse.ArgumentParser(
         prog="hal emulate",

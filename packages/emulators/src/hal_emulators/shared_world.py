@@ -45,9 +45,8 @@ class ArmInWorld:
     def __init__(self, address: str, name: str, role: str = "arm") -> None:
         """Enter the world; with the role ``fingers`` as the gripper of that arm, which has an emulator of its own.
 
-        Raises:
-            ConnectionLost: There is no such world.
-            ValueError: It has no arm of this name; lists those that it has.
+        Raises ConnectionLost if there is no such world, ValueError if it has no arm of this name; lists those that it
+        has.
         """
         self.fingers: tuple[float, float, float] | None = None
         connection, answer = Connection.connect(address, _START, role=role, name=name)
@@ -96,7 +95,6 @@ class ArmInWorld:
             self.object_width, self._reached = answer["object"], answer["t"]
 
     def close(self) -> None:
-        """Leave the world."""
         if self._connection is not None:
             self._connection.close()
         self._connection, self.object_width, self._reached = None, None, math.inf
@@ -123,11 +121,7 @@ def has_world(config: str, overrides: Sequence[str] = ()) -> bool:
 
 @contextlib.contextmanager
 def run_world(config: str, overrides: Sequence[str] = ()) -> Iterator[None]:
-    """Run the world of a rig in a process of its own, unless another emulator of the rig runs it.
-
-    Raises:
-        ValueError: It does not start; the message has the reason.
-    """
+    """Run the world of a rig in a process of its own, unless another emulator runs it. Raises ValueError."""
     words = [word for value in overrides for word in ("--set", value)]
     command = [sys.executable, "-m", "hal_emulators.world", "--config", config, *words]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
@@ -168,16 +162,7 @@ def enter_world(
 ) -> ArmInWorld:
     """Return the place of an arm in the simulated world of its rig, which is run until the stack is closed.
 
-    Args:
-        stack: Closed when the emulator ends.
-        config: The rig.
-        overrides: Changes of it.
-        arm: The arm.
-        role: As for :class:`ArmInWorld`.
-
-    Raises:
-        ConfigError: The rig is not valid.
-        ConnectionLost, ValueError: Its world does not start, or has no such arm.
+    Raises ConfigError, and ConnectionLost and ValueError if its world does not start, or has no such arm.
     """
     stack.enter_context(run_world(config, overrides))
     raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late

@@ -12,11 +12,7 @@ from hal.serial_line import EMULATED
 
 
 class PseudoTerminal:
-    """A pseudo terminal, and the link that leads to it.
-
-    Attributes:
-        descriptors: What to read from and write to; none while it is away.
-    """
+    """A pseudo terminal, and the link that leads to it. Its ``descriptors`` are none while it is away."""
 
     def __init__(self, port: str) -> None:
         """Choose the name. Raises ValueError if it is not that of an emulator, or is taken."""

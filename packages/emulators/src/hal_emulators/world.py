@@ -177,12 +177,7 @@ class WorldServer:
     """Steps a world in real time, and serves emulators and programs."""
 
     def __init__(self, spec: WorldSpec) -> None:
-        """Build the world and listen.
-
-        Raises:
-            ConfigError: Something in the record cannot be loaded.
-            OSError: ``EADDRINUSE``: another program has this world.
-        """
+        """Build the world and listen. Raises ConfigError, and OSError ``EADDRINUSE`` if another program has it."""
         self._spec = spec
         self._poller = select.epoll()
         self._listeners: dict[int, socket.socket] = {}

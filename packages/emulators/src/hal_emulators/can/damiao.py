@@ -93,7 +93,6 @@ class DamiaoMotor:
         self.restart()
 
     def restart(self) -> None:
-        """Become as after switching on: off, without a fault."""
         self.status = MotorStatus.DISABLED
         self.drive: Drive | None = None
         """Content of the last command since it was enabled."""
@@ -144,14 +143,7 @@ class DamiaoMotor:
 
 
 class EmulatedDamiaoArm:
-    """An arm with Damiao motors, and its gripper if that has one on the same bus.
-
-    Attributes:
-        motors: The motors by their number (their id), those of the arm first.
-        plant: The arm's mechanics.
-        gripper: The gripper's; None without one.
-        world: The simulated world that it is in; None for none.
-    """
+    """An arm with Damiao motors (by their id), and its gripper if that has one on the same bus."""
 
     def __init__(self, spec: RobotSpec) -> None:
         """Build it from the arm's record in a rig."""
@@ -245,7 +237,6 @@ class EmulatedDamiaoArm:
         world.fingers = world.now, width, max(closing / abs(slope), 0.0) if pressing else 0.0
 
     def report(self) -> dict[str, Any]:
-        """Return the state of every motor, for programs and people."""
         motors = {
             motor.id: {
                 "status": f"{int(motor.status):X}",
@@ -277,7 +268,6 @@ class EmulatedDamiaoArm:
         motor.set_ranges()
 
     def set_temperature(self, number: int, mosfet: int, rotor: int) -> None:
-        """Change what a motor reports, deg C."""
         motor = self._motor(number)
         motor.mosfet, motor.rotor = mosfet, rotor
 

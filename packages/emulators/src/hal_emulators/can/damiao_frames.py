@@ -50,11 +50,7 @@ class MotorSide(MotorCodec):
     """The driver's codec, and the reverse: decoder of the commands, and encoder of the feedback."""
 
     def decode_command(self, data: bytes | bytearray) -> MotorCommand:
-        """Return the content of a command; its special forms (ENABLE, ...) have to be recognised before.
-
-        Raises:
-            ValueError: It has not 8 bytes.
-        """
+        """Return the content of a command, which is none of the special forms (ENABLE, ...). Raises ValueError."""
         bits, (p, v, t) = read_bits(data), self.limits
         return MotorCommand(
             (bits >> 48) * (2.0 * p / 65535.0) - p,
@@ -67,11 +63,7 @@ class MotorSide(MotorCodec):
     def encode_feedback(
         self, motor: int, status: int, q: float, dq: float, tau: float, mosfet: int = 30, rotor: int = 30
     ) -> bytes:
-        """Return the data of a feedback frame; ``motor`` is the motor's id, the others are as in MotorFeedback.
-
-        Raises:
-            ValueError: A number is NaN.
-        """
+        """Return the data of a feedback frame; arguments as in MotorFeedback. Raises ValueError for NaN."""
         p, v, t = self.limits
         position = 65535 if q >= p else 0 if q <= -p else int((q + p) * 65535.0 / (2.0 * p))
         velocity = 4095 if dq >= v else 0 if dq <= -v else int((dq + v) * 4095.0 / (2.0 * v))

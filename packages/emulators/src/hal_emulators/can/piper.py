@@ -72,14 +72,7 @@ _BEYOND_LIMIT, _STOPPED = 0x4, 0x1
 
 
 class EmulatedPiperArm:
-    """An emulated PiPER with its gripper.
-
-    Attributes:
-        plant: The arm's mechanics.
-        status: Code of the arm's state (see ``ARM_STATUS``); 0 is normal.
-        firmware: Version that it reports.
-        world: The simulated world that it is in; None for none.
-    """
+    """An emulated PiPER with its gripper; ``status`` is a key of ``ARM_STATUS``."""
 
     def __init__(self, spec: RobotSpec) -> None:
         """Build it from the arm's record in a rig."""
@@ -269,7 +262,6 @@ class EmulatedPiperArm:
             self.flags[self._joint(number)] = status
 
     def set_temperature(self, number: int, driver: int, motor: int) -> None:
-        """Change what a joint reports, deg C."""
         self._temperatures[self._joint(number)] = (driver, motor)
 
     def set_object(self, width: float | None) -> None:
@@ -277,7 +269,6 @@ class EmulatedPiperArm:
         self._object = width or 0.0
 
     def set_register(self, number: int, name: str, value: float) -> None:
-        """Raise ValueError: a PiPER has no registers."""
         raise ValueError("a PiPER has no registers")
 
     @property

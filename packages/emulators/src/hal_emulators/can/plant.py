@@ -56,12 +56,8 @@ class JointMechanics(NamedTuple):
 class ArmPlant:
     """An arm of n joints. All arrays are (n,), in rad, rad/s and Nm.
 
-    Attributes:
-        q: Joint positions.
-        dq: Joint velocities.
-        tau: Torques of the motors in the last step.
-        held: Whether something outside holds the arm, so that it does not move: a stand, or a hand.
-        push: External torques.
+    While it is ``held``, by a stand or a hand, it does not move; ``push`` are external torques, ``tau`` those of the
+    motors.
     """
 
     def __init__(
@@ -73,11 +69,7 @@ class ArmPlant:
     ) -> None:
         """Build it from a URDF, with every joint that is not the arm's locked where it is 0.
 
-        Args:
-            kinematics: The arm's URDF, joints and tcp.
-            mechanics: One record for each joint.
-            q: Start position.
-            base_orientation: Quaternion (xyzw) of the URDF's root in the world; gravity points down there.
+        Gravity points down in the world, where the URDF's root has the orientation ``base_orientation`` (xyzw).
         """
         joints = kinematics.joints
         full = pin.buildModelFromUrdf(kinematics.urdf)
@@ -115,12 +107,7 @@ class ArmPlant:
         self.held = True
 
     def load(self, mass_factor: float | None = None, payload: tuple[float, Sequence[float]] | None = None) -> None:
-        """Change what the arm weighs; None leaves a value as it is.
-
-        Args:
-            mass_factor: Factor on the masses and inertias of all links.
-            payload: Mass, kg, and its place (3,) in the frame of the tcp, m.
-        """
+        """Change the factor on all masses, or the payload, kg and its place (3,) in the frame of the tcp, m."""
         if mass_factor is not None:
             self.mass_factor = mass_factor
         if payload is not None:
@@ -209,16 +196,9 @@ class ArmPlant:
 
 
 class GripperPlant:
-    """A gripper's motor with its fingers: one angle, between two stops and an object that it may close on.
-
-    Attributes:
-        q: Angle, rad.
-        dq: Speed, rad/s.
-        tau: Torque of the motor in the last step, Nm.
-    """
+    """A gripper's motor with its fingers: one angle, between two stops and an object that it may close on."""
 
     def __init__(self, mechanics: JointMechanics, q: float, lower: float, upper: float) -> None:
-        """Build one at ``q``, which can turn from ``lower`` to ``upper``, rad."""
         self._mechanics = mechanics
         self.coulomb = mechanics.coulomb
         """Coulomb friction, Nm."""
@@ -227,7 +207,6 @@ class GripperPlant:
         """Where the fingers meet a stop or an object, rad."""
 
     def step(self, dt: float, drive: Drive) -> None:
-        """Move the gripper on by ``dt``, s, under this drive of its motor."""
         inertia, coulomb, viscous, limit = self._mechanics
         velocity = self._solve(dt, drive, inertia, coulomb, viscous)
         torque = drive.tau + drive.kp * (drive.q - self.q - dt * velocity) + drive.kd * (drive.dq - velocity)

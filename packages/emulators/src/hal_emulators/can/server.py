@@ -89,12 +89,10 @@ class FrameFaults:
         """Number of a motor, 0 for all -> time until which it neither hears nor answers, on the monotonic clock, s."""
 
     def silent(self, motor: int, now: float) -> bool:
-        """Return whether a motor is silent."""
         until = self.silent_until
         return bool(until) and (until.get(0, 0.0) > now or until.get(motor, 0.0) > now)
 
     def lose(self, motor: int, source: random.Random) -> bool:
-        """Return whether this reply is lost."""
         for number in (motor, 0):
             left = self.lose_next.get(number, 0)
             if left > 0:
@@ -243,12 +241,7 @@ class EmulatedBus:
 
 
 class CanEmulator:
-    """All CAN arms of a rig, each on its bus.
-
-    Attributes:
-        arms: The arms by name.
-        buses: Their buses.
-    """
+    """All CAN arms of a rig, each on its bus."""
 
     def __init__(
         self,
@@ -258,19 +251,11 @@ class CanEmulator:
         realtime: bool = False,
         in_world: bool = False,
     ) -> None:
-        """Build the arms of a rig that have a CAN driver and are not simulated.
+        """Build the arms of a rig, given as for :func:`hal.open`, that have a CAN driver and are not simulated.
 
-        Args:
-            config: The rig, as for :func:`hal.open`.
-            overrides: Changes of it, as for :func:`hal.open`.
-            seed: Of random losses.
-            realtime: Give its threads the priority of a servo, for a process that does nothing else.
-            in_world: Put the arms into the simulated world that :func:`hal_emulators.shared_world.run_world` runs.
-
-        Raises:
-            ConfigError: The rig has problems.
-            ValueError: It has no arm on a CAN bus.
-            ConnectionLost: There is no such world.
+        With ``realtime`` its threads have the priority of a servo; with ``in_world`` the arms are in the simulated
+        world that :func:`hal_emulators.shared_world.run_world` runs. Raises ConfigError, ValueError if the rig has no
+        such arm, and ConnectionLost if there is no such world.
         """
         specs = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in _ARMS]
         if not specs:
@@ -292,7 +277,6 @@ class CanEmulator:
         return execute(self, words)
 
     def bus_of(self, arm: EmulatedArm) -> EmulatedBus:
-        """Return the bus that an arm is on."""
         return next(bus for bus in self.buses if arm.name in bus.arms)
 
     def start(self) -> None:

@@ -42,8 +42,6 @@ _MANUAL_ERRORS = frozenset({"joint_position_limits_violation"})
 
 
 class ArmReply(NamedTuple):
-    """A response to a request."""
-
     name: str
     number: int
     body: bytes
@@ -277,7 +275,6 @@ class EmulatedArm:
         return None
 
     def stop(self) -> RequestOutcome:
-        """End the running motion."""
         self._refuse_pending()
         if self.motion is None:
             return RequestOutcome.NOT_POSSIBLE
@@ -285,7 +282,6 @@ class EmulatedArm:
         return RequestOutcome.SUCCESS
 
     def recover(self) -> RequestOutcome:
-        """Clear the errors."""
         if self.stops.emergency:
             return RequestOutcome.EMERGENCY
         if self.motion is not None or self.stops.user or self.stops.guiding:

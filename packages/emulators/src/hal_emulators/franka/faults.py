@@ -31,7 +31,6 @@ class PacketLoss:
         self.share, self.next = share, 0
 
     def loses_next(self) -> bool:
-        """Return whether the next packet is lost."""
         if self.next > 0:
             self.next -= 1
             return True
@@ -50,19 +49,12 @@ class SetpointReports:
         self.clear()
 
     def clear(self) -> None:
-        """Report correctly again."""
         self.lag = 0
         self.noise = 0.0
         self.measured = False
 
     def shown(self, sample: MotionSample, q: Floats, dq: Floats) -> MotionSample:
-        """Return the reported set-point of this cycle.
-
-        Args:
-            sample: True set-point.
-            q: Measured position (7,), rad.
-            dq: Measured speed (7,), rad/s.
-        """
+        """Return the set-point that is reported of this cycle's, at the measured ``q`` and ``dq``."""
         self._samples.appendleft(sample)
         if self.measured:
             sample = MotionSample(q, dq, sample.ddq)
@@ -106,7 +98,6 @@ class InjectedFaults:
         self.clear()
 
     def clear(self) -> None:
-        """End all faults."""
         self.states = PacketLoss(self.seed)
         self.commands = PacketLoss(self.seed + 1)
         self.silent_until = 0.0

@@ -74,12 +74,9 @@ class HandServer:
         """Build it.
 
         Args:
-            host: Address to listen on.
-            version: Protocol that it speaks.
             object_width: Width of an object between the fingers, m.
             period: Time between two states, s.
             homed: False for a hand that was just switched on.
-            port: Port to listen on.
             world: The simulated world that its arm is in, whose objects the fingers meet.
         """
         self.world = world

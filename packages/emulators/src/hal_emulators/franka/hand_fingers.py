@@ -22,8 +22,6 @@ _BLOCKED = 100.0  # s until a Move that meets an object is answered, as users re
 
 
 class FingerMotionKind(Enum):
-    """The three kinds of motion."""
-
     HOMING = "homing"
     GRASP = "grasp"
     MOVE = "move"
@@ -99,7 +97,6 @@ class Fingers:
             self.width = min(FULL_WIDTH, self.width + _SPRING)
 
     def release(self) -> None:
-        """End the pressing force."""
         self.is_grasped, self.force = False, 0.0
 
     def put(self, object_width: float | None) -> None:

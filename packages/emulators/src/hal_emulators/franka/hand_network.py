@@ -102,7 +102,6 @@ class HandStatePacket(NamedTuple):
     """Degrees Celsius."""
 
     def pack(self) -> bytes:
-        """Return the 23 bytes of the datagram."""
         return _STATE.pack(self.message_id & 0xFFFFFFFF, self.width, self.max_width, self.is_grasped, self.temperature)
 
 
@@ -211,7 +210,6 @@ class HandNetwork:
         self._selector.register(sock, selectors.EVENT_READ)
 
     def send_answers(self, now: float) -> None:
-        """Send the answers that are due."""
         if self.client is not None:
             try:
                 self.client.send_due(now)
@@ -219,14 +217,12 @@ class HandNetwork:
                 self.disconnect()
 
     def send_state(self, state: HandStatePacket) -> None:
-        """Send a state to the client, if there is one."""
         client = self.client
         if client is not None and client.udp_port is not None and self._udp is not None:
             with contextlib.suppress(OSError):
                 self._udp.sendto(state.pack(), (client.ip, client.udp_port))
 
     def disconnect(self) -> None:
-        """Close the client's connection, if there is one."""
         client, self.client = self.client, None
         if client is not None:
             self._selector.unregister(client.sock)
@@ -243,7 +239,6 @@ class HandNetwork:
             self._udp.close()
 
     def close(self) -> None:
-        """Close every socket."""
         self.shut()
         self._selector.close()
         self._wake_in.close()

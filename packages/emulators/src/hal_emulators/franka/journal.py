@@ -23,13 +23,7 @@ class Journal:
         self._number = 0
 
     def record(self, kind: str, text: str, **details: object) -> None:
-        """Record an event.
-
-        Args:
-            kind: Kind of event, for programs.
-            text: One line for people.
-            details: Further plain values.
-        """
+        """Record an event: its kind and further values for programs, a line for people."""
         self._number += 1
         self._events.append({"n": self._number, "t": time.monotonic(), "kind": kind, "text": text, **details})
         if not self._quiet:

@@ -257,14 +257,10 @@ class _Arm:
 
 
 def write_model_library(urdf: str) -> bytes:
-    """Return the shared object.
+    """Return the shared object. Raises ValueError if a joint does not turn about the z axis of its link.
 
-    Args:
-        urdf: The arm from base to flange, as :func:`~.plant.arm_only` returns it. What the flange carries is an
-            argument of the functions.
-
-    Raises:
-        ValueError: If a joint does not turn about the z axis of its link.
+    ``urdf`` is the arm from base to flange, as :func:`~.plant.arm_only` returns it. What the flange carries is an
+    argument of the functions.
     """
     arm = _Arm(urdf)
     functions = {"M_NE": _inertia(arm), "c_NE": _coriolis(arm), "g_NE": _gravity(arm)}

@@ -196,9 +196,7 @@ def arm_only(urdf: str) -> str:
 
     Prefixes before ``link`` and ``joint`` are removed. The client's library requires seven joints and a frame named
     exactly ``link8``, and does not check either: with other names it reads beyond its memory when it loads the model.
-
-    Raises:
-        ValueError: Without a link whose name ends in ``link8``.
+    Raises ValueError without a link whose name ends in ``link8``.
     """
     root = _parse_urdf(remove_shapes(urdf))
     joints = {_end(joint, "child"): joint for joint in root.findall("joint")}

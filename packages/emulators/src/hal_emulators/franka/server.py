@@ -47,7 +47,6 @@ class Pacing:
     """Lock-step only: time after which an answer counts as lost, s."""
 
     def describe(self) -> str:
-        """Return a short description."""
         if not self.lockstep:
             return "real time"
         return "lock-step, paced" if self.paced else "lock-step"
@@ -93,19 +92,13 @@ _SEND_TIMEOUT = 1.0
 
 
 class ArmRequest(NamedTuple):
-    """A request as received."""
-
     code: int
     number: int
     payload: bytes
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a listening socket.
-
-    Raises:
-        OSError: With host and port in its text, if they are in use or not of this machine.
-    """
+    """Return a listening socket. Raises OSError that names host and port."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -119,8 +112,6 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 class ArmClient:
-    """One connected client."""
-
     def __init__(self, connection: socket.socket, host: str) -> None:
         self.tcp = connection
         self.tcp.settimeout(_SEND_TIMEOUT)
@@ -178,7 +169,6 @@ class ArmClient:
             self.udp.sendto(packet, (self.peer, self._port))
 
     def commands(self) -> list[bytes]:
-        """Return the datagrams that arrived, oldest first."""
         found: list[bytes] = []
         with contextlib.suppress(OSError):
             while len(found) < _MAX_COMMANDS:
@@ -186,7 +176,6 @@ class ArmClient:
         return found
 
     def close(self) -> None:
-        """Close both sockets."""
         self.tcp.close()
         self.udp.close()
 
@@ -244,7 +233,6 @@ class ArmServer:
         return future.result()
 
     def run(self, ends: Sequence[object]) -> None:
-        """Serve until something is in ``ends``."""
         self._ends = ends
         while not ends:
             self._gather()
@@ -256,7 +244,6 @@ class ArmServer:
                 self.world.exchange(DT, self.arm.plant.q)
 
     def close(self) -> None:
-        """Close every socket."""
         if self.session is not None:
             self._end_session("the emulator ends")
         self._listener.close()

@@ -25,16 +25,10 @@ class SoftwareCamera:
     """
 
     def __init__(self, spec: CameraSpec, **options: Any) -> None:
-        """Create the camera, plugged in.
+        """Create the camera, plugged in; options are fields of :class:`~.settings.Emulation`.
 
-        Args:
-            spec: Title, and rates, sizes, formats, lenses and poses of the streams; streams that it leaves out are
-                roughly those of a D435.
-            options: Fields of :class:`~.settings.Emulation`.
-
-        Raises:
-            DriverMissing: If librealsense is not installed.
-            CommandError: For an unknown option or an impossible value.
+        Streams that the spec leaves out are roughly those of a D435. Raises DriverMissing without librealsense,
+        CommandError for a wrong option.
         """
         load_realsense()
         self.emulation = Emulation.from_options(options)
@@ -83,15 +77,10 @@ class SoftwareCamera:
             self._connect()
 
     def expected(self, number: int, modes: Mapping[str, Any] | None = None) -> dict[str, NDArray[Any]]:
-        """Return exactly the images of a frame number.
+        """Return exactly the images of the frame that has this number for depth, by stream.
 
-        Args:
-            number: The number that the library gives to the depth frame.
-            modes: Stream -> :class:`~.pictures.StreamMode`; by default :attr:`modes`.
-
-        Returns:
-            Stream -> image: depth in its units (``DEPTH_UNIT``), colour in the format that is streamed; see
-            :meth:`.pictures.EmulatedImages.expected`.
+        Depth is in its units (``DEPTH_UNIT``), colour in the format that is streamed; see
+        :meth:`.pictures.EmulatedImages.expected`.
         """
         chosen = modes or self.modes
         return {name: self._feeder.images.expected(name, mode, number) for name, mode in chosen.items()}

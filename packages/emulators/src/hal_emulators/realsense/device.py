@@ -158,15 +158,9 @@ class EmulatedDevice:
             sensor.set_metadata(getattr(self._rs.frame_metadata_value, key), value)
 
     def push(self, stream: str, mode: StreamMode, image: NDArray[Any], number: int, stamp: float, domain: str) -> None:
-        """Hand an image to the library, which copies it; without effect while nobody streams.
+        """Hand an image in its mode's format to the library, which copies it; without effect while nobody streams.
 
-        Args:
-            stream: Name of the stream.
-            mode: Its mode.
-            image: In the mode's format.
-            number: Frame number.
-            stamp: Time stamp, ms.
-            domain: Clock of the stamp, a name of ``rs2_timestamp_domain``.
+        ``stamp`` is in ms, on the clock ``domain``, a name of ``rs2_timestamp_domain``.
         """
         rs = self._rs
         frame = rs.software_video_frame()  # a new one each time: the library frees the last one's pixels
@@ -227,7 +221,6 @@ class DevicesRemoved:
         return False
 
     def get_new_devices(self) -> list[Any]:
-        """Return no devices."""
         return []
 
 

@@ -71,7 +71,6 @@ class FrameFeeder:
             self._device = device
 
     def stop(self) -> None:
-        """Stop the thread. Idempotent."""
         self._stopped.set()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=5.0)
@@ -173,20 +172,11 @@ def write_recording(
     seed: int = 0,
     lost: Collection[int] = (),
 ) -> None:
-    """Write a recording of an emulated camera, at once, with the times of a live one.
+    """Write a recording (``.db3``) of an emulated camera, at once, with the times of a live one.
 
-    Args:
-        path: New file that ends in ``.db3``.
-        spec: The camera's record; its ``streams`` are recorded.
-        frames: The frame numbers are 1 to ``frames``; the images are those of :meth:`.SoftwareCamera.expected`.
-        metadata: Whether frames carry metadata. Without, the library plays them badly matched.
-        pattern: As :attr:`.Emulation.pattern`.
-        seed: As :attr:`.Emulation.seed`.
-        lost: Frame numbers that are left out.
-
-    Raises:
-        CommandError: If the file exists or has another suffix.
-        DriverMissing: If librealsense is not installed.
+    The frame numbers are 1 to ``frames`` without those that are ``lost``; the images are those of
+    :meth:`.SoftwareCamera.expected`. Without ``metadata``, the library plays frames badly matched. Raises CommandError
+    if the file exists or has another suffix, DriverMissing without librealsense.
     """
     path = Path(path)
     if path.suffix != ".db3" or path.exists():

@@ -164,14 +164,10 @@ def draw_number(image: NDArray[Any], format: str, number: int) -> None:
 
 
 def read_number(image: NDArray[Any], format: str | None = None) -> int:
-    """Return the number that is drawn into an image.
+    """Return the number that is drawn into an image. Raises ValueError if there is none.
 
-    Args:
-        image: The image as it was sent, or a scaled centre crop that keeps its upper edge; depth raw or in metres.
-        format: Needed for packed colour only (``yuyv``, ``uyvy``).
-
-    Raises:
-        ValueError: If the image contains no number.
+    The image is as it was sent, or a scaled centre crop that keeps its upper edge; depth raw or in metres. ``format``
+    is needed for packed colour only (``yuyv``, ``uyvy``).
     """
     plane = image if image.ndim == 2 else image[..., 0]
     height, width = plane.shape
@@ -301,13 +297,7 @@ class EmulatedImages:
     """
 
     def __init__(self, streams: dict[str, EmulatedStream], pattern: str, seed: int) -> None:
-        """Prepare nothing yet.
-
-        Args:
-            streams: As :func:`make_streams` returns them.
-            pattern: ``test`` (gradients) or ``scene``.
-            seed: Another one gives other images.
-        """
+        """Prepare nothing yet. The pattern is ``test`` (gradients) or ``scene``."""
         self._streams = streams
         self._scene = EmulatedScene(seed) if pattern == "scene" else None
         self._seed = seed

@@ -76,7 +76,6 @@ class EmulatedGripper:
             self.position = self.object_count
 
     def take(self, request: Request) -> None:
-        """Take what was written to the registers."""
         before, self.request = self.request, request
         if not request.act:
             self.state, self.object, self._way = 0, 0, []
@@ -87,7 +86,6 @@ class EmulatedGripper:
             self.object = 0
 
     def fail(self, fault: int) -> None:
-        """Raise a fault, or end it with 0."""
         self.fault = fault
         if fault >= _MAJOR:
             self.state, self.object, self._way = 0, 0, []

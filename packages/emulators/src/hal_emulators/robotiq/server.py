@@ -37,11 +37,9 @@ def find_grippers(config: str | Path | Mapping[str, Any], overrides: Sequence[st
 
 
 class RobotiqEmulator:
-    """Emulated grippers, each on its line.
+    """Emulated grippers, each on its line, by the name of the arm.
 
-    Attributes:
-        ports: Their lines, by the name of the arm.
-        paced: Whether the fingers move in real time; otherwise only by :meth:`advance`.
+    Unless it is ``paced``, the fingers move only by :meth:`advance`.
     """
 
     def __init__(
@@ -99,11 +97,7 @@ class RobotiqEmulator:
                     port.send_due(monotonic())
 
     def execute(self, line: str) -> dict[str, Any]:
-        """Execute a command, and return its answer; with several grippers the arm's name is its first word.
-
-        Raises:
-            ValueError: It is invalid.
-        """
+        """Execute a command, which may begin with the arm's name, and return its answer. Raises ValueError."""
         words = line.split()
         port = self.ports[words.pop(0)] if words and words[0] in self.ports else next(iter(self.ports.values()))
         with self.lock:
@@ -116,7 +110,6 @@ class RobotiqEmulator:
         self._thread.start()
 
     def stop(self) -> None:
-        """Take all lines away."""
         self.read_end.set()
         if self._thread.is_alive():
             self._thread.join(5.0)

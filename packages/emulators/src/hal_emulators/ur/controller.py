@@ -166,7 +166,6 @@ class Controller(NetworkController):
             self.stop_program("local control")
 
     def answer_dashboard(self, line: str) -> str:
-        """Return the dashboard's answer to a command."""
         e_series = self.version[0] == 5
         answers = {
             "polyscopeversion": f"URSoftware {'.'.join(map(str, self.version))} (Jun 01 2024)",

@@ -50,10 +50,7 @@ def parameters(robot: str) -> Vector:
 def forward(dh: Vector, q: Sequence[float], tcp: Sequence[float]) -> Floats:
     """Return the pose of the tcp in the controller's base frame: m, and a rotation vector, rad.
 
-    Args:
-        dh: DH parameters, as from :func:`parameters`.
-        q: Joint positions (6,), rad.
-        tcp: The tcp in the frame of the flange: m, and a rotation vector, rad.
+    The tcp is given so in the frame of the flange; ``dh`` is as from :func:`parameters`.
     """
     model, data, flange = _chain(dh.tobytes())
     pinocchio.forwardKinematics(model, data, np.asarray(q, float))
@@ -85,13 +82,11 @@ class TargetMotion:
         self.place(q)
 
     def place(self, q: Sequence[float]) -> None:
-        """Be somewhere else, at rest."""
         self.q, self.dq, self.ddq = list(q), [0.0] * 6, [0.0] * 6
         self.actual_q, self.actual_dq = list(q), [0.0] * 6
         self.hold()
 
     def hold(self) -> None:
-        """Stay where the target is."""
         self._kind = "hold"
         self._between = list(self.q)
 

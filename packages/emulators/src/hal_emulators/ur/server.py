@@ -74,7 +74,6 @@ COMMANDS = make_commands(
 
 
 def _type_of(name: str) -> str:
-    """Return the type of an RTDE variable."""
     if _VECTORS.fullmatch(name):
         return "VECTOR6D"
     if name == "joint_mode":
@@ -121,8 +120,6 @@ class _Recipe:
 
 
 class _Client(Client):
-    """One connection."""
-
     output: _Recipe | None = None
     every, started = 1, False
 
@@ -203,7 +200,6 @@ class UrServer(NetworkArm):
             self.send(client, struct.pack(">HB", 3 + len(reply), ord(kind)) + reply)
 
     def publish(self) -> None:
-        """Send the state to every client that asked for it."""
         self._cycle += 1
         state = None
         for client in list(self.clients):

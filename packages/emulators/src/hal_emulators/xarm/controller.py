@@ -141,7 +141,6 @@ class Controller(NetworkController):
 
     @property
     def state(self) -> int:
-        """Its state."""
         return self._halted or (MOVING if max(map(abs, self.dq)) > 1e-3 else READY)
 
     @property
@@ -152,7 +151,6 @@ class Controller(NetworkController):
     # Commands.
 
     def hold(self) -> None:
-        """Stay here."""
         self.target = list(self.q)
         self._course: deque[tuple[float, Floats]] = deque([(_LONGEST, self.target)] * 4, 4)
         self._t_set = 0.0
@@ -213,7 +211,6 @@ class Controller(NetworkController):
             self.raise_error(1)
 
     def jog(self, joint: int, angle: float) -> None:
-        """Move a joint by hand, rad."""
         self.q[joint] += angle
         self.hold()
 
@@ -258,7 +255,6 @@ class Controller(NetworkController):
     # Each cycle.
 
     def step(self) -> None:
-        """Let a cycle pass."""
         self.now += DT
         self.gripper.step(DT)
         if self._goal is not None:

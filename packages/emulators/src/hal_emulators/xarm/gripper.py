@@ -42,7 +42,6 @@ class Gripper:
         return self.object_width is not None and self.target < self.position and self.width <= self.object_width
 
     def step(self, dt: float) -> None:
-        """Let ``dt`` s pass."""
         goal = min(max(self.target, 0), _OPEN)
         step = _RATE * self.speed / 5000 * dt
         before = self.position
