@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,18 @@ import viser
 import websockets.asyncio.server
 from viser import ClientHandle, GuiEvent, ViserServer
 
-from hal.errors import HalError
+from hal.errors import HalError, NotSupported
+from hal.geometry import Pose
 from hal.host.hosts import SNAPSHOT_CAPACITY
 from hal.host.memory import SeriesBox
 from hal.host.process import Channel, SharedMemory, serve
 from hal.host.records import GroupMemory
 from hal.host.scheduling import yield_to_others
-from hal.specs import GroupSpec, from_json
+from hal.kinematics.collisions import in_one_place
+from hal.specs import CollisionSpec, GroupSpec, from_json
 
 from .scene import PAGE, ArmView, BodiesView
+from .shapes import ShapesView
 
 _NICE = 10
 """Niceness of this process: everything else comes first."""
@@ -32,7 +36,7 @@ _FRAME = 1 / 30
 _IDLE = 0.1
 """The same while no page is open, s."""
 _WORLD_PERIOD = 1 / 15
-"""Time between two updates of the bodies around the arms, s."""
+"""Time between two updates of the bodies around the arms, and of the shapes that are near each other, s."""
 _REPEAT = 0.1
 """Time after which a goal is sent again as a sign of life, s."""
 
@@ -123,6 +127,7 @@ class ViewerPage:
                     self.world = BodiesView(server.scene, group.world, snapshots, self.notes)
                 except HalError as error:
                     self.notes.append(f"the world is not drawn: {error}")
+        self._shapes = self._draw_shapes(groups)
         bodies = [body for group in groups if group.world is not None for body in group.world.bodies]
         if not any(body.shape == "plane" and body.visible for body in bodies):
             server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
@@ -132,6 +137,17 @@ class ViewerPage:
         reset_button = server.gui.add_button("Reset gizmo", hint="Put it back to the tool, and clear its goal.")
         reset_button.on_click(self._reset_handles)
         server.on_client_disconnect(self._on_disconnect)
+
+    def _draw_shapes(self, groups: Sequence[GroupSpec]) -> dict[str, ShapesView]:
+        """Return what is drawn of each arm whose collision shapes are known."""
+        arms, drawn = [arm.spec for arm in self.arms], dict[str, ShapesView]()
+        for group in groups:
+            for robot in group.robots:
+                others = [arm for arm in arms if arm is not robot and not in_one_place(robot, arm)]
+                with suppress(NotSupported):  # the host says so
+                    check = group.collisions or CollisionSpec(own=False, arms=False)
+                    drawn[robot.name] = ShapesView(self._server.scene, robot, others, check)
+        return drawn
 
     @property
     def watched(self) -> bool:
@@ -181,9 +197,20 @@ class ViewerPage:
         with self._server.atomic():
             for arm in self.arms if watched else ():
                 arm.update()
-            if self.world is not None and now >= self._due:
+            if now >= self._due:
                 self._due = now + _WORLD_PERIOD
-                self.world.update(watched=watched)
+                if self.world is not None:
+                    self.world.update(watched=watched)
+                if watched:
+                    self._show_shapes()
+
+    def _show_shapes(self) -> None:
+        states = {arm.spec.name: arm.state for arm in self.arms if arm.state is not None}
+        for arm in self.arms:
+            shapes, state, goal = self._shapes.get(arm.spec.name), arm.state, arm.drag.goal
+            if shapes is not None and state is not None:
+                shapes.show_near(states)
+                shapes.show_ghost(arm.mail, state, None if goal is None else Pose(goal.position, goal.orientation))
 
 
 def _set_camera(server: ViserServer, bases: Sequence[Sequence[float]]) -> None:

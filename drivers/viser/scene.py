@@ -120,8 +120,8 @@ class ArmView:
             positions = self.spec.gripper.finger_positions(gripper.state.width)
             values |= dict(zip(self.spec.gripper.joints, positions, strict=True))
         for joint, node in self._links:
-            _move_node(node, *joint.placement(values))
-        _move_node(self._set, state.tcp_set.position.tolist(), state.tcp_set.orientation.tolist())
+            move_node(node, *joint.placement(values))
+        move_node(self._set, state.tcp_set.position.tolist(), state.tcp_set.orientation.tolist())
         self._update_handle(state)
 
     def _update_handle(self, state: RobotState) -> None:
@@ -133,9 +133,9 @@ class ArmView:
             self._handle = self._new_handle()
         with suppress(ValueError):  # sent just now by a page; the next update corrects it
             if goal is not None:  # for a second page, and for one whose drag was refused
-                _move_node(self._handle, goal.position, goal.orientation)
+                move_node(self._handle, goal.position, goal.orientation)
             elif free:
-                _move_node(self._handle, state.tcp.position.tolist(), state.tcp.orientation.tolist())
+                move_node(self._handle, state.tcp.position.tolist(), state.tcp.orientation.tolist())
 
 
 def _draw_links(
@@ -218,7 +218,7 @@ class BodiesView:
         for body, _, nodes in self._drawn.values():
             frames = self._world.link_frames([(body.id, link) for link in range(len(nodes))])
             for node, frame in zip(nodes, frames, strict=True):
-                _move_node(node, frame[:3, 3], matrix_to_quaternion(frame[:3, :3]))
+                move_node(node, frame[:3, 3], matrix_to_quaternion(frame[:3, :3]))
 
     def _draw_changes(self) -> None:
         """Draw the bodies that are new or look different, and remove those that are gone."""
@@ -270,7 +270,7 @@ def _draw_visuals(scene: SceneApi, parent: str, visuals: Sequence[Visual], notes
         scene.add_glb(f"{parent}/visual", data)
 
 
-def _move_node(node: SceneNodeHandle, position: Vector, orientation: Vector) -> None:
+def move_node(node: SceneNodeHandle, position: Vector, orientation: Vector) -> None:
     """Set the pose of a node in its parent's frame, unless it is there already; orientation x, y, z, w."""
     at, turn = np.asarray(position, float), np.asarray(_wxyz(orientation))
     if not _alike(node.position, at):

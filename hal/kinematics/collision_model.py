@@ -349,7 +349,7 @@ def _reach(model: Any, geometry: Any, columns: Sequence[int], pin: Any) -> Array
     axes = _axes(model, pin)
     for i, item in enumerate(geometry.geometryObjects):
         joint = int(item.parentJoint)
-        points = np.array([item.placement.act(point) for point in _outline(item.geometry)])
+        points = np.array([item.placement.act(point) for point in outline_of(item.geometry)])
         distance = float(np.linalg.norm(points, axis=1).max())
         lever = float(np.linalg.norm(np.cross(points, axes[joint]), axis=1).max()) if joint else 0.0
         while joint > 0:
@@ -376,7 +376,7 @@ def _axes(model: Any, pin: Any) -> Array:
     return axes
 
 
-def _outline(shape: Any) -> Array:
+def outline_of(shape: Any) -> Array:
     """Return points (k, 3) whose hull contains a shape of coal."""
     kind = type(shape).__name__
     if kind == "Box":

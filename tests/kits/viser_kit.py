@@ -34,7 +34,7 @@ class PlainPage:
         else:
             self.socket = unix_connect(address, "ws://viser/", **options)
         self.nodes: dict[str, dict[str, Any]] = {}
-        """Newest ``position`` and ``wxyz`` of each node, by name."""
+        """Newest ``position``, ``wxyz``, ``visible`` and ``color`` of each node, by name."""
         self.buttons: dict[str, str] = {}
         self.say(
             "ViewerCameraMessage",
@@ -84,6 +84,10 @@ class PlainPage:
             self.nodes.setdefault(name, {})["position"] = message["position"]
         elif kind == "SetOrientationMessage":
             self.nodes.setdefault(name, {})["wxyz"] = message["wxyz"]
+        elif kind == "SetSceneNodeVisibilityMessage":
+            self.nodes.setdefault(name, {})["visible"] = message["visible"]
+        elif kind == "SceneNodeUpdateMessage":
+            self.nodes.setdefault(name, {}).update(message["updates"])
         elif kind == "GuiButtonMessage":
             self.buttons[message["props"]["label"]] = message["uuid"]
 

@@ -34,6 +34,7 @@ from hal.kinematics.urdf import read_urdf
 pytestmark = pytest.mark.slow
 
 HANDLE = "/arms/panda/handle"
+AMBER, RED = (240, 160, 30), (220, 40, 40)
 
 
 def open_rig() -> hal.Rig:
@@ -175,6 +176,34 @@ def test_links_fingers_and_handle_follow_the_arm(rig: hal.Rig, viewer: ViserView
     assert viewer.goal("panda") is None
     assert viewer.notes == ()
     assert "viser" in viewer.describe()
+
+
+def test_a_ghost_shows_the_goal_and_shapes_that_are_near_each_other_are_amber_then_red(
+    rig: hal.Rig, viewer: ViserViewer, page: PlainPage
+) -> None:
+    def colors(root: str) -> set[tuple[int, ...]]:
+        page.hear()
+        shown = [node for name, node in page.nodes.items() if name.startswith(f"{root}/") and node.get("visible")]
+        return {tuple(node["color"]) for node in shown}
+
+    arm = rig.robots["panda"]
+    arm.move_to(arm.home, speed=0.3)
+    until(lambda: not colors("/ghost/panda") and not colors("/near/panda"))
+    seen: list[set[tuple[int, ...]]] = []
+    with arm.control(rate_hz=20, tcp_speed=0.2) as control:
+        for tick in rig.clock.rate(20):
+            here = arm.state(max_age=2.0).tcp_set
+            control.send(CartesianTarget(Pose(here.position - (0.0, 0.0, 0.045), here.orientation)))  # to the table
+            near = colors("/near/panda")
+            if near and colors("/ghost/panda") and near not in seen:
+                seen.append(near)
+            if seen and RED in seen[-1]:
+                break
+            assert tick.elapsed < 30.0, seen
+    assert seen[0] == {AMBER}
+    assert RED in seen[-1]
+    arm.move_to(arm.home, speed=0.3)
+    until(lambda: not colors("/ghost/panda") and not colors("/near/panda"))
 
 
 def test_drag_sets_a_goal_until_it_is_cleared(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
