@@ -38,6 +38,7 @@ def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
     import hal
     from hal.config import load
+    from hal.registry import pad_driver
     from hal.remote.link import PORT
     from hal.remote.server import Server, check_servable
     from hal.views import Listen
@@ -47,7 +48,8 @@ def main(args: argparse.Namespace) -> int:
     check_servable(plan)
     if not may_open(plan):
         return ACTION_NEEDED
-    with hal.open(**config_options(args), pad="evdev") as rig:
+    pad = pad_driver("plugged") if sys.platform == "linux" else "none"  # whose library is installed there only
+    with hal.open(**config_options(args), pad=pad) as rig:
         server = Server(rig, listen.address, listen.port if listen.fixed else PORT, _report)
         _report(banner(rig))
         keys = server.entrance.credentials
