@@ -20,8 +20,8 @@ def held(bench: Bench) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("right", "up", "expected"),
-    [(0.0, 1.0, (1.0, 0.0)), (0.0, -0.54, (-0.5, 0.0)), (-1.0, 0.0, (0.0, 1.0)), (0.54, 0.0, (0.0, -0.5))],
-    ids=["forward", "back at half speed", "left", "right at half speed"],
+    [(0.0, 1.0, (1.0, 0.0)), (0.54, 0.0, (0.0, -0.5))],
+    ids=["forward", "right at half speed"],
 )
 def test_a_disc_moves_the_arm_its_way_at_its_speed(bench, page, right, up, expected):
     """0.08 of the way is the dead zone, so 0.54 of it is half the speed."""

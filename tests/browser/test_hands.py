@@ -73,14 +73,14 @@ def enter(page: Browser, down: bool, again: bool = False) -> None:
 # What takes the hands from the page is not let in.
 
 
-@pytest.mark.parametrize("place", ["#view", "#rig", "#joints", "#log", "#hold", "#stop"])
-def test_no_menu_opens_anywhere(page: Browser, place: str) -> None:
+def test_no_menu_opens_anywhere(page: Browser) -> None:
     page.run("window.menus = []; addEventListener('contextmenu', (e) => window.menus.push(e.defaultPrevented))")
-    at = page.place(place)
-    button(page, "mousePressed", at, "right", 2)
-    button(page, "mouseReleased", at, "right", 0)
-    wait_for(lambda: page.run("return window.menus.length"), "the menu to be asked for")
-    assert page.run("return window.menus") == [True]
+    for count, place in enumerate(("#view", "#rig", "#joints", "#log", "#hold", "#stop"), 1):
+        at = page.place(place)
+        button(page, "mousePressed", at, "right", 2)
+        button(page, "mouseReleased", at, "right", 0)
+        wait_for(lambda count=count: page.run("return window.menus.length") >= count, f"the menu of {place}")
+        assert page.run("return window.menus") == [True] * count, place
 
 
 def test_a_menu_that_cannot_be_prevented_releases_everything(bench: Bench, page: Browser) -> None:

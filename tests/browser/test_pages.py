@@ -94,9 +94,20 @@ SIZES = [
 NEEDED = ["#stop", "#hold", '[data-disc="dpad"]', '[data-disc="right"]', "#deadman", "#speed", "#frame"]
 
 
-@pytest.mark.parametrize(("width", "height", "touch"), SIZES)
-def test_the_main_controls_are_in_view_and_apart(page: Browser, width: int, height: int, touch: bool) -> None:
-    page.size(width, height, touch)
+def test_the_main_controls_are_in_view_and_apart(page: Browser) -> None:
+    for width, height, touch in SIZES:
+        page.size(width, height, touch)
+        check_the_main_controls(page, width, height)
+    page.tap("Escape", "Escape")
+    wait_for(lambda: page.text("#trip"), "the alarm")
+    for size in SIZES:
+        page.size(*size)
+        alarm, picture = page.place("#trip"), page.place("#cameras")
+        assert alarm["bottom"] <= picture["top"] or alarm["top"] >= picture["bottom"], "the alarm covers the picture"
+
+
+def check_the_main_controls(page: Browser, width: int, height: int) -> None:
+    """Check that each is in the window, large enough, and covered by none."""
     places = {name: page.place(name) for name in NEEDED}
     for name, at in places.items():
         assert at["width"] >= 24, name
@@ -121,10 +132,6 @@ def test_the_main_controls_are_in_view_and_apart(page: Browser, width: int, heig
         places["#stop"],
     )
     assert top, "something covers the stop button"
-    page.tap("Escape", "Escape")
-    wait_for(lambda: page.text("#trip"), "the alarm")
-    alarm, picture = page.place("#trip"), page.place("#cameras")
-    assert alarm["bottom"] <= picture["top"] or alarm["top"] >= picture["bottom"], "the alarm covers the picture"
 
 
 TEXTS = """const found = [];
@@ -135,12 +142,12 @@ TEXTS = """const found = [];
     }"""
 
 
-@pytest.mark.parametrize(("width", "height", "touch"), [*SIZES, (960, 600, False)])
-def test_no_text_is_smaller_than_twelve_pixels(page: Browser, width: int, height: int, touch: bool) -> None:
-    page.size(width, height, touch)
+def test_no_text_is_smaller_than_twelve_pixels(page: Browser) -> None:
     script = "return found.filter(([at]) => parseFloat(getComputedStyle(at).fontSize) < 12).map(([, text]) => text)"
-    assert page.run(TEXTS + script) == []
-    assert page.run("return document.documentElement.scrollWidth") <= width
+    for width, height, touch in (*SIZES, (960, 600, False)):
+        page.size(width, height, touch)
+        assert page.run(TEXTS + script) == [], (width, height)
+        assert page.run("return document.documentElement.scrollWidth") <= width
 
 
 CONTRAST = """
@@ -173,18 +180,18 @@ def test_every_text_can_be_read_and_every_control_has_a_name(page: Browser) -> N
     assert [node for node in controls if not node["ignored"] and not node["name"]["value"]] == []
 
 
-@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1024, 768), (960, 600)])
-def test_every_key_that_drives_is_named_on_a_screen_with_a_keyboard(page: Browser, width: int, height: int) -> None:
+def test_every_key_that_drives_is_named_on_a_screen_with_a_keyboard(page: Browser) -> None:
     """960x600 is a laptop's window at 150 % zoom."""
-    page.size(width, height)
-    shown = page.run(
-        """return [...document.querySelectorAll('.discs kbd, #home kbd')]
-               .filter((one) => one.checkVisibility())
-               .filter((one) => one.getBoundingClientRect().bottom <= innerHeight)
-               .map((one) => one.textContent)"""
-    )
-    assert set(shown) == {"Q", "E", "arrows", "G", "H", "W A S D", "I J K L", "Home"}
-    assert page.run("return [...document.querySelectorAll('.pad')].every((one) => !one.checkVisibility())")
+    for size in ((1440, 900), (1024, 768), (960, 600)):
+        page.size(*size)
+        shown = page.run(
+            """return [...document.querySelectorAll('.discs kbd, #home kbd')]
+                   .filter((one) => one.checkVisibility())
+                   .filter((one) => one.getBoundingClientRect().bottom <= innerHeight)
+                   .map((one) => one.textContent)"""
+        )
+        assert set(shown) == {"Q", "E", "arrows", "G", "H", "W A S D", "I J K L", "Home"}, size
+        assert page.run("return [...document.querySelectorAll('.pad')].every((one) => !one.checkVisibility())")
 
 
 def test_the_keys_of_the_gripper_stand_beside_what_they_do(page: Browser) -> None:

@@ -229,7 +229,7 @@ class TestEmulatedRobotiq(GripperContract, left_out={"freeze": "a gripper that d
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.pair
 class TestEmulatedXarmGripper(GripperContract, left_out={"freeze": "a gripper that does not answer is lost"}):
     """The driver and xarm-python-sdk against the emulator, in real time."""
 

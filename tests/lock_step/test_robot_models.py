@@ -1,4 +1,7 @@
-"""Every built-in model of an arm whose package is installed, alone in a world, on each engine."""
+"""Every built-in model of an arm whose package is installed, alone in a world, on one engine or the other.
+
+The contract of each model on each engine is in tests/contract/test_robot_models.py.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmark_kit import load_benchmark
-from engines_kit import Engine
+from engines_kit import Engine, has_engine
 
 import hal
+from hal import registry
 from hal.config.data_files import list_data
 from hal.errors import ConfigError
 from hal.types import Trip
 
 robots = load_benchmark("robots")
 pytestmark = pytest.mark.slow
+INSTALLED = [name for name in registry.ENGINES if has_engine(name)]
 ENTRIES = [entry for model in list_data("robots") for entry in robots.entries(model)]
 
 
@@ -34,7 +39,14 @@ def installed() -> Iterator[None]:
         raise
 
 
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: "-".join(entry.values()))
+@pytest.mark.parametrize(
+    ("entry", "engine"),
+    [
+        pytest.param(entry, INSTALLED[turn % len(INSTALLED)], id="-".join(entry.values()))
+        for turn, entry in enumerate(ENTRIES)
+    ],
+    indirect=["engine"],
+)
 def test_a_model_drives_closes_its_gripper_and_stays_where_a_reset_put_it(
     engine: Engine, entry: dict[str, Any]
 ) -> None:

@@ -22,7 +22,7 @@ from .franka_kit import Emulator
 from .rig_kit import Drive, arm_of, rig_of, settled
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.pair
 
 DOCS = Path(__file__).parents[2] / "docs" / "measured.md"
 

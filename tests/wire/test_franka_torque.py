@@ -15,8 +15,7 @@ pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
 
 
-@pytest.mark.parametrize("losses", ["lose-commands 0", "lose-commands 0.05"])
-@pytest.mark.parametrize("robot", ["fr3", "panda"])
+@pytest.mark.parametrize(("robot", "losses"), [("fr3", "lose-commands 0"), ("panda", "lose-commands 0.05")])
 def test_an_arm_on_torques(emulator: Emulator, robot: str, losses: str) -> None:
     with rig_of(emulator.host, robot, lock_step=True) as rig:
         arm = arm_of(rig)

@@ -84,7 +84,12 @@ def answers(arm: hal.Robot) -> bool:
         return False
 
 
-@pytest.mark.parametrize("command", ["unplug on", "power on", "silent 2 on", "error 3 32", "lose 1", "late 0.2"])
+@pytest.mark.parametrize(
+    ("emulator", "command"),
+    [("so101", one) for one in ("unplug on", "power on", "silent 2 on", "error 3 32", "lose 1", "late 0.2")]
+    + [("viperx", one) for one in ("power on", "error 3 32")],  # what each protocol says in its own way
+    indirect=["emulator"],
+)
 def test_a_fault_of_bus_or_motor_stops_the_program_and_the_arm_moves_again_afterwards(
     emulator: ServoBusProcess, command: str
 ) -> None:

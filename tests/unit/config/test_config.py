@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from engines_kit import AUTO
-from jsonschema import Draft202012Validator, ValidationError
+from jsonschema import Draft202012Validator
 
 from hal.config import load
 from hal.config.data_files import find_data, list_data
@@ -428,15 +428,18 @@ def test_the_json_schema_for_editors_is_up_to_date() -> None:
     assert json.loads(shipped) == rig_schema(), "run: hal schema > config/rig.schema.json"
 
 
+@pytest.fixture(scope="module")
+def validator() -> Draft202012Validator:
+    return Draft202012Validator(rig_schema())
+
+
 @pytest.mark.parametrize("name", list_data("config"))
-def test_shipped_rigs_name_the_schema_and_fit_it(name: str) -> None:
+def test_shipped_rigs_name_the_schema_and_fit_it(name: str, validator: Draft202012Validator) -> None:
     file = find_data("config", f"{name}.yaml")
     first, _, text = file.read_text().partition("\n")
     assert first == "# yaml-language-server: $schema=rig.schema.json"
-    validator = Draft202012Validator(rig_schema())
     validator.validate(yaml.safe_load(text))
-    with pytest.raises(ValidationError):
-        validator.validate(yaml.safe_load(text) | {"robots": {"arm": {"modle": "panda"}}})
+    assert not validator.is_valid(yaml.safe_load(text) | {"robots": {"arm": {"modle": "panda"}}})
 
 
 @pytest.mark.parametrize(("boxes", "count"), [([], 1), (["table"], 0)])

@@ -6,7 +6,6 @@ The truth is hidden: frames come without the camera's pose, the setup without th
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator
 from itertools import pairwise
@@ -21,6 +20,8 @@ from hal.calibration import CalibrationFailed, ManualDrive, add_view
 from hal.deadman import Deadman
 
 pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+
+pytestmark = pytest.mark.slow
 
 MOST_MM, MOST_DEGREES = 2.0, 0.3
 RIGS = ("panda_calibration", "panda_calibration_held")
@@ -42,6 +43,7 @@ def bench(name: str) -> Iterator[CalibrationBench]:
 def test_the_camera_is_found(bench: CalibrationBench, seed: int) -> None:
     arm = bench.collector.robot
     start = arm.state().q
+    watched = watch_distances(bench)
     found = bench.drive(15, seed)
     millimetres, degrees = bench.off(found)
     assert millimetres <= MOST_MM
@@ -52,6 +54,25 @@ def test_the_camera_is_found(bench: CalibrationBench, seed: int) -> None:
     assert np.ptp(links, axis=0).max() > 0.1, "the arm went somewhere"
     assert any("30 mm and 5.0 degrees from the initial guess" in line for line in bench.told)
     assert np.abs(arm.state().q - start).max() < 0.01, "and came back"
+    nearest, lowest = np.min(watched, axis=0)
+    assert nearest > 0.3, "it kept its distance from the board"
+    assert lowest > 0.0, "and its workspace"
+
+
+def watch_distances(bench: CalibrationBench) -> list[tuple[float, float]]:
+    """Return where every view adds how far the camera is from the board, and the tcp above its workspace's floor."""
+    world, arm, take = bench.rig.world, bench.collector.robot, bench.collector.take_view
+    found: list[tuple[float, float]] = []
+
+    def watched() -> Any:
+        in_hand = bench.collector.setup.eye == "in-hand"
+        camera = world.pose("panda", "panda_hand") @ bench.truth if in_hand else bench.truth
+        away = float(np.linalg.norm(camera.position - world.pose("charuco_board").position))
+        found.append((away, float(arm.state().tcp.position[2] - arm.spec.workspace.lower[2])))
+        return take()
+
+    bench.collector.take_view = watched
+    return found
 
 
 @pytest.mark.parametrize(
@@ -71,7 +92,6 @@ def test_images_of_another_sensor_give_the_pose_of_the_colour_sensor(options: li
         assert any("30 mm and 5.0 degrees from the initial guess" in line for line in bench.told)
 
 
-@pytest.mark.slow
 def test_with_pybullets_own_renderer() -> None:
     name, options = "panda_calibration", ["simulation.renderer=tiny"]
     with hal.open(name, sim=True, clock="lock_step", pad="none", overrides=options) as rig:
@@ -109,27 +129,6 @@ def test_a_view_similar_to_another_is_rejected(bench: CalibrationBench) -> None:
     assert add_view(bench.collector, bench.told.append) is None
     assert len(bench.collector.views) == 1
     assert len(bench.collector.rejected) == 1
-
-
-def test_the_arm_keeps_its_distance_and_its_workspace(bench: CalibrationBench) -> None:
-    """Looked at in every step, by the world's own truth."""
-    world, arm = bench.rig.world, bench.collector.robot
-    box = arm.spec.workspace
-    nearest, lowest = math.inf, math.inf
-    take = bench.collector.take_view
-
-    def watched() -> Any:
-        nonlocal nearest, lowest
-        in_hand = bench.collector.setup.eye == "in-hand"
-        camera = world.pose("panda", "panda_hand") @ bench.truth if in_hand else bench.truth
-        nearest = min(nearest, float(np.linalg.norm(camera.position - world.pose("charuco_board").position)))
-        lowest = min(lowest, float(arm.state().tcp.position[2] - box.lower[2]))
-        return take()
-
-    bench.collector.take_view = watched
-    bench.drive(12)
-    assert nearest > 0.3
-    assert lowest > 0.0
 
 
 class Presses(hal.Teleop):
