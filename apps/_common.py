@@ -74,9 +74,9 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
     )
     rig.add_argument(
         "--viewer",
-        choices=["gui", "3d", "none"],
+        choices=["3d", "none"],
         default="none",
-        help="window of the simulation, or 3D view on the page of the console",
+        help="3D view on the page of the console",
     )
     rig.add_argument("--console", action="store_true", help="serve the page also when another gamepad drives")
     rig.add_argument(

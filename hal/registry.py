@@ -90,8 +90,6 @@ class DriverSpec:
     shared_world: str | None = None
     """"module:function" of the record of a world that has only mirrors of emulated arms: it returns the world that
     their emulators share, as a :class:`~hal.world.WorldDriver`, or None."""
-    viewer: str | None = None
-    """A window with the simulated world: :class:`~hal.views.Viewer`."""
     viewer3d: str | None = None
     """A page with the arms in 3D: :class:`~hal.views.Viewer3D`."""
     pictures: str | None = None
@@ -152,7 +150,7 @@ class DriverSpec:
         return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
-_VIEWS = ("viewer", "viewer3d", "pictures", "software_renderer", "console")
+_VIEWS = ("viewer3d", "pictures", "software_renderer", "console")
 _KINDS = ("robot", "gripper", "camera", "gamepad", "leader", "world", *_VIEWS)
 
 

@@ -20,7 +20,7 @@ from . import registry
 from .camera import Camera, find_place
 from .clock import Clock, LockStepClock, RealClock
 from .commands import StopLatch
-from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
+from .errors import CommandError, ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups, start_processes
@@ -35,7 +35,7 @@ from .world import NoWorld, World
 
 if TYPE_CHECKING:
     from .specs import Plan
-    from .views import CameraRenderer, Viewer, Viewer3D
+    from .views import CameraRenderer, Viewer3D
 
 T = TypeVar("T")
 _FIRST_FRAME = 5.0
@@ -68,7 +68,7 @@ def open_rig(
         overrides: Values for keys of the rig file, as ``KEY=VALUE`` strings or a mapping.
         pad: Device behind a pad of ``model: auto``: ``auto``, ``evdev``, ``web`` (the console), ``terminal``, ``demo``
             (a recorded tour), the path of a recording, or ``none`` for no pad.
-        viewer: ``"gui"`` opens a window with the simulated world, ``"3d"`` serves a page with the arms in 3D.
+        viewer: ``"3d"`` serves a page with the arms in 3D, ``"none"`` none.
         console: Serve the console, even if another pad drives.
         listen: Address and port of the console, ``ADDRESS[:PORT]``; this computer only by default.
         realtime: Request real-time scheduling (SCHED_FIFO) and locked memory for the servos in real time; if they are
@@ -125,7 +125,6 @@ class Rig:
         self.viewer3d: Viewer3D | None = None
         """The view of the arms in 3D on the console's page; None if there is none."""
         self._pictures: CameraRenderer | None = None
-        self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
         self._observer = Observer(self)
         self._closed = False
@@ -149,7 +148,7 @@ class Rig:
         if console or viewer == "3d" or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)
         if world_host is not None:
-            self._open_world_views(world_host, viewer)
+            self._open_renderer(world_host)
         self._wait_for_hosts(realtime)
         if world_host is not None:
             self.world = World(world_host.request, partial(self._pass_on_edit, world_host), self.plan.world)
@@ -217,19 +216,15 @@ class Rig:
         host = next(host for host in self._hosts if spec in host.spec.grippers)
         return Gripper(spec, robot.name, host, self.clock)
 
-    def _open_world_views(self, host: Host, viewer: str) -> None:
-        """Open what displays the simulated world: the renderer of its cameras, and a window."""
+    def _open_renderer(self, host: Host) -> None:
+        """Open the renderer of the simulated cameras, if there are any."""
         world = host.spec.world
         assert world is not None
         cameras = [camera for camera in self.plan.cameras if camera.driver == world.driver]
         if cameras:
             self._pictures = registry.load(world.driver, "pictures")(host, cameras, self.plan.renderer)
-        if viewer == "gui":
-            self._viewer = registry.load(world.driver, "viewer")(host)
-        for shown in (self._pictures, self._viewer):
-            if shown is not None:
-                shown.wait_ready()
-                self.notes.extend(shown.notes)
+            self._pictures.wait_ready()
+            self.notes.extend(self._pictures.notes)
 
     def _open_cameras(self) -> None:
         for spec in self.plan.cameras:
@@ -423,7 +418,7 @@ class Rig:
     def _pass_on_edit(self, host: Host, method: str, params: dict[str, Any], revision: int) -> None:
         if method == "add":
             self.notes.extend(text for text in host.request("warnings") if text not in self.notes)
-        for shown in (self._pictures, self._viewer, self.viewer3d):
+        for shown in (self._pictures, self.viewer3d):
             if shown is not None:
                 with contextlib.suppress(ConnectionLost):  # its own next use raises the error
                     shown.note_edit(method, params, revision)
@@ -438,7 +433,7 @@ class Rig:
             return
         errors: list[BaseException] = []
         sessions = [robot._open for robot in self.robots.values() if robot._open is not None]
-        shown = [item for item in (self.viewer3d, self.console, self._viewer, self._pictures) if item is not None]
+        shown = [item for item in (self.viewer3d, self.console, self._pictures) if item is not None]
         ends = [device.close for device in (*sessions, *self.gamepads.values(), *self.cameras.values(), *shown)]
         ends.insert(len(ends) - len(shown), self._warn_of_devices)
         ends += [host.request_close for host in self._hosts]  # all at the same time: lowering an arm takes seconds
@@ -520,12 +515,8 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     ]
     if wrong:
         raise ConfigError(wrong)
-    if viewer == "gui" and plan.world is None:
-        raise NotSupported("there is no simulated world to view; leave the viewer out", code="no_world")
-    if viewer == "gui" and plan.engine is not None and registry.driver(plan.engine).viewer is None:
-        raise NotSupported(
-            f"the engine {plan.engine!r} has no window of its own; use the 3D view: viewer='3d'", code="no_viewer"
-        )
+    if viewer not in ("none", "3d"):
+        raise CommandError(f"viewer is 'none' or '3d', not {viewer!r}", code="unknown_viewer")
     if viewer == "3d":
         registry.load(registry.provider("viewer3d"), "viewer3d")
     if console or viewer == "3d" or any(chosen.input == "console" for chosen in pads):

@@ -299,17 +299,6 @@ class CameraRenderer(WorldView):
         """Return what the driver of this camera takes its images from."""
 
 
-class Viewer(WorldView):
-    """A window with the simulated world.
-
-    Args:
-        host: Process of the world.
-    """
-
-    def __init__(self, host: Host) -> None:
-        self.host = host
-
-
 class Viewer3D(WorldView):
     """A rig's arms in 3D on the console's page, with a draggable handle on each tcp.
 

@@ -11,7 +11,6 @@ DRIVER = DriverSpec(
     camera="hal.drivers.scene.camera:SimulatedCamera",
     pictures="hal.drivers.scene.camera:SimulatedPictures",
     pictures_preflight="hal.drivers.scene.camera:check_pictures",
-    viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
     checks={"camera": "hal.drivers.scene.depth_noise:check"},
     requires={"mujoco": "pip install 'robot-hal[mujoco]'"},
 )

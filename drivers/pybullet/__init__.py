@@ -15,7 +15,6 @@ DRIVER = DriverSpec(
     pictures="hal.drivers.scene.camera:SimulatedPictures",
     software_renderer="hal.drivers.pybullet.tiny:TinyRenderer",
     pictures_preflight="hal.drivers.scene.camera:check_pictures",
-    viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
     checks={"camera": "hal.drivers.scene.depth_noise:check"},
     requires={"pybullet": "pip install 'robot-hal[sim]' (Python 3.10, 3.11, or a C++ compiler)"},
 )

@@ -87,15 +87,13 @@ class PyBulletClient:
     """PyBullet's functions with the id of one world filled in; ``client.stepSimulation()`` steps that world.
 
     Each function is bound once, so a call costs no look-up (``pybullet_utils``' client binds it at every call). Raises
-    DriverMissing if PyBullet is not installed, or its window cannot open.
+    DriverMissing if PyBullet is not installed.
     """
 
-    def __init__(self, *, gui: bool = False) -> None:
+    def __init__(self) -> None:
         self._module = load_pybullet()
         with silence_output():
-            self.id: int = self._module.connect(self._module.GUI if gui else self._module.DIRECT)
-        if self.id < 0:
-            raise DriverMissing("PyBullet could not open its window; is there a display (see the DISPLAY variable)?")
+            self.id: int = self._module.connect(self._module.DIRECT)
 
     def __getattr__(self, name: str) -> Any:
         attribute = getattr(self._module, name)

@@ -8,13 +8,11 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from html import escape
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.drivers.scene.drawn import PLANE
 from hal.drivers.scene.records import check_names, hulls_of, joint_drives, mimics_of, pad_links, primitive_size
 from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless, mesh_points
 from hal.drivers.scene.values import listed
@@ -41,25 +39,23 @@ FINGER_MASS = 0.1
 The drive that moves with it is in no URDF. Fingers at rest have their own mass, so that the arm's inertia is right."""
 
 
-def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> tuple[Body, list[str]]:
-    """Load an object, with its visual shapes if it is ``drawn``; return it with warnings for the user.
+def load_object(client: PyBulletClient, spec: BodySpec) -> tuple[Body, list[str]]:
+    """Load an object; return it with warnings for the user.
 
     Raises ConfigError if its file is missing or broken, or a size that its shape needs is missing.
     """
     key = f"objects.{spec.name}"
     if spec.shape == "mesh":
-        return _describe(client, spec, _make_mesh(client, spec, key, drawn), key), []
+        return _describe(client, spec, _make_mesh(client, spec, key), key), []
     if spec.shape != "urdf":
-        number = _make_shape(client, spec, drawn)
+        number = _make_shape(client, spec)
         body = _describe(client, spec, number, key)
         return body, []
     if spec.urdf is None:
         raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf", "missing_key")])
     urdf = checked_urdf(spec.urdf, f"{key}.urdf")
     lacking = massless(urdf)
-    number = _load_urdf(
-        client, spec.urdf, f"{key}.urdf", fixed=spec.fixed or spec.robot is not None, scale=spec.scale, drawn=drawn
-    )
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=spec.fixed or spec.robot is not None, scale=spec.scale)
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
     _lighten_frames(client, body, urdf)
     _couple(client, body, mimics_of(spec, urdf))
@@ -71,7 +67,7 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> 
     return body, warnings
 
 
-def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> tuple[Body, list[str]]:
+def load_robot(client: PyBulletClient, spec: RobotSpec) -> tuple[Body, list[str]]:
     """Load an arm, with its base fixed in the world.
 
     Takes, returns and raises the same as :func:`load_object`; a joint or link that the URDF lacks is a ConfigError too.
@@ -81,7 +77,7 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
     lacking = massless(urdf)
     pads = pad_links(spec, urdf)
     tight = {name: urdf.links[name].collisions for name in pads}
-    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn, tight=tight)
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, tight=tight)
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
     _lighten_frames(client, body, urdf)
     moving = {name: joint for name, joint in body.joints.items() if joint in body.movable}
@@ -173,15 +169,13 @@ def _load_urdf(
     *,
     fixed: bool,
     scale: float,
-    drawn: bool,
     tight: Mapping[str, Sequence[UrdfVisual]] | None = None,
 ) -> int:
     number = -1
     with loadable_urdf(path, tight) as file, silence_output() as captured:
         try:
-            flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
-            if not drawn:
-                flags |= client.URDF_IGNORE_VISUAL_SHAPES
+            # Without the inertia of the file, PyBullet invents one from the collision shapes.
+            flags = client.URDF_USE_INERTIA_FROM_FILE | client.URDF_IGNORE_VISUAL_SHAPES
             number = client.loadURDF(file, useFixedBase=fixed, globalScaling=scale, flags=flags)
         except client.error:
             pass  # reported below, with what PyBullet printed
@@ -196,33 +190,24 @@ def _load_urdf(
     return number
 
 
-def _make_shape(client: PyBulletClient, spec: BodySpec, drawn: bool) -> int:
-    at: Sequence[float] = (0.0, 0.0, 0.0)
+def _make_shape(client: PyBulletClient, spec: BodySpec) -> int:
     size = primitive_size(spec)
     if spec.shape == "box":
-        solid = seen = {"shapeType": client.GEOM_BOX, "halfExtents": size}
+        solid = {"shapeType": client.GEOM_BOX, "halfExtents": size}
     elif spec.shape == "sphere":
-        solid = seen = {"shapeType": client.GEOM_SPHERE, "radius": size[0]}
-    elif spec.shape == "plane":  # infinite in contacts; drawn as a thin box whose upper face is the plane
-        x, y = (spec.half_extents or (*PLANE, 0.0))[:2]
+        solid = {"shapeType": client.GEOM_SPHERE, "radius": size[0]}
+    elif spec.shape == "plane":
         solid = {"shapeType": client.GEOM_PLANE, "planeNormal": (0.0, 0.0, 1.0)}
-        seen = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
-        at = (0.0, 0.0, -0.005)
     else:
-        radius, length = size
         kind = client.GEOM_CYLINDER if spec.shape == "cylinder" else client.GEOM_CAPSULE
-        solid = {"shapeType": kind, "radius": radius, "height": length}
-        seen = {"shapeType": kind, "radius": radius, "length": length}
+        solid = {"shapeType": kind, "radius": size[0], "height": size[1]}
     shape = client.createCollisionShape(**solid) if spec.collision else -1
-    visual = -1
-    if drawn and spec.visible:
-        visual = client.createVisualShape(**seen, rgbaColor=spec.rgba, visualFramePosition=at)
     mass = spec.mass if has_free_base(spec, None) else 0.0
-    number: int = client.createMultiBody(mass, shape, visual)
+    number: int = client.createMultiBody(mass, shape)
     return number
 
 
-def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -> int:
+def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str) -> int:
     """Make an object of the shape ``mesh`` from the hulls that collide: PyBullet reads several only from a URDF."""
     hulls = hulls_of(spec)
     free = has_free_base(spec, None)
@@ -231,10 +216,6 @@ def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) ->
         for k, hull in enumerate(hulls if spec.collision else ()):
             _write_hull(hull, Path(place) / f"{k}.obj")
             parts.append(f'<collision><geometry><mesh filename="{k}.obj"/></geometry></collision>')
-        if drawn and spec.visible:
-            size, name, rgba = " ".join([str(spec.scale)] * 3), escape(str(spec.mesh)), " ".join(map(str, spec.rgba))
-            look = f'<material name="it"><color rgba="{rgba}"/></material>'
-            parts.append(f"<visual><geometry><mesh filename='{name}' scale='{size}'/></geometry>{look}</visual>")
         if free:
             solid = uniform_solid(hulls)
             roll, pitch, yaw = _rpy(solid.axes)
@@ -248,7 +229,7 @@ def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) ->
             parts.append(f'<inertial><mass value="0"/>{nothing}</inertial>')
         file = Path(place) / "mesh.urdf"
         file.write_text(f'<robot name="it"><link name="base">{"".join(parts)}</link></robot>')
-        return _load_urdf(client, str(file), f"{key}.mesh", fixed=not free, scale=1.0, drawn=drawn)
+        return _load_urdf(client, str(file), f"{key}.mesh", fixed=not free, scale=1.0)
 
 
 def _rpy(axes: NDArray[np.float64]) -> tuple[float, float, float]:

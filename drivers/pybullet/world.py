@@ -1,9 +1,4 @@
-"""The simulated world of a rig: one PyBullet client that simulated arms, grippers and cameras are views of.
-
-The same class is the world that is stepped and the one in PyBullet's window. That one is a mirror: it is made from the
-same record and never stepped, repeats the edits of :attr:`PyBulletWorld.MIRRORED` in their order, and
-:meth:`PyBulletWorld.show` poses it by a :meth:`PyBulletWorld.snapshot` of that revision.
-"""
+"""The simulated world of a rig: one PyBullet client that simulated arms, grippers and cameras are views of."""
 
 from __future__ import annotations
 
@@ -20,7 +15,7 @@ from typing import Any
 from hal.drivers.scene.engine import IDENTITY, AppliedForce, RayFound
 from hal.drivers.scene.values import completed_dynamics, numbers
 from hal.drivers.scene.world import SimulatedWorld
-from hal.errors import Fault, NotSupported
+from hal.errors import Fault
 from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
@@ -69,18 +64,16 @@ LEAST_HZ = 100.0
 
 
 class PyBulletWorld(SimulatedWorld[Body]):
-    """One simulation and all bodies in it; a ``mirror`` is posed by snapshots and never stepped.
+    """One simulation and all bodies in it.
 
-    Raises ConfigError with every problem in the record, DriverMissing without PyBullet or where its window cannot open.
+    Raises ConfigError with every problem in the record, DriverMissing without PyBullet.
     """
 
     ENGINE = "PyBullet"
 
-    def __init__(self, spec: WorldSpec, *, mirror: bool = False, gui: bool = False) -> None:
+    def __init__(self, spec: WorldSpec) -> None:
         super().__init__(spec)
-        self.mirror = mirror
-        self._drawn = gui
-        self.client = PyBulletClient(gui=gui)
+        self.client = PyBulletClient()
         folder = MEMORY if os.path.isdir(MEMORY) else None
         self._file = tempfile.NamedTemporaryFile(suffix=".bullet", dir=folder)  # noqa: SIM115  # until close()
         """PyBullet saves and restores states by files only."""
@@ -97,13 +90,12 @@ class PyBulletWorld(SimulatedWorld[Body]):
             self.client.setPhysicsEngineParameter(**SOLVER)
             self._set_solution()
             self.load_bodies((*spec.bodies, *spec.robots))
-            if not mirror:
-                self.check_overlaps()
-                if spec.physics_hz < LEAST_HZ:
-                    self.warnings.append(
-                        f"physics_hz is {spec.physics_hz:g}: below {LEAST_HZ:g}, PyBullet lets objects sink into each "
-                        "other by some mm; use 240, or MuJoCo, which divides long steps"
-                    )
+            self.check_overlaps()
+            if spec.physics_hz < LEAST_HZ:
+                self.warnings.append(
+                    f"physics_hz is {spec.physics_hz:g}: below {LEAST_HZ:g}, PyBullet lets objects sink into each "
+                    "other by some mm; use 240, or MuJoCo, which divides long steps"
+                )
         except BaseException:
             self.close()
             raise
@@ -116,8 +108,6 @@ class PyBulletWorld(SimulatedWorld[Body]):
 
     def step(self) -> None:
         """Make one physics step."""
-        if self.mirror:
-            raise NotSupported("a mirror is posed by show(), never stepped")
         if self.fault is not None:
             self.steps += 1
             return
@@ -158,10 +148,6 @@ class PyBulletWorld(SimulatedWorld[Body]):
                 "reset the world; use a smaller contact_stiffness, masses that differ less, or a higher physics_hz",
             )
 
-    def show(self, snapshot: Sequence[float]) -> None:
-        """Place every body as in a snapshot of the same revision. Raises ValueError for one of other bodies."""
-        self._layout.apply(snapshot)
-
     def handle(self, name: str, active: bool) -> None:
         """Report whether a robot's fingers move or hold something, which takes a finer solution.
 
@@ -187,7 +173,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
 
     def load_body(self, spec: BodySpec | RobotSpec) -> Body:
         load = load_robot if isinstance(spec, RobotSpec) else load_object
-        body, warnings = load(self.client, spec, self._drawn)  # type: ignore[arg-type]  # of that kind
+        body, warnings = load(self.client, spec)  # type: ignore[arg-type]  # of that kind
         self.warnings += warnings
         return body
 
@@ -365,15 +351,9 @@ class PyBulletWorld(SimulatedWorld[Body]):
     def measure_box(self, body: Body) -> tuple[list[float], list[float]]:
         return bounding_box(self.client, body)
 
-    def paint_body(self, body: Body, rgba: list[float]) -> None:
-        if not self._drawn:
-            return
-        for link in {shape[1] for shape in self.client.getVisualShapeData(body.id)}:
-            self.client.changeVisualShape(body.id, link, rgbaColor=rgba)
-
 
 class SnapshotLayout:
-    """Reads and applies snapshots of a set of bodies, in the layout of :meth:`hal.world.WorldDriver.snapshot`.
+    """Reads snapshots of a set of bodies, in the layout of :meth:`hal.world.WorldDriver.snapshot`.
 
     Fixed bases are read once, by the constructor: make a new layout when one was moved.
     """
@@ -412,27 +392,3 @@ class SnapshotLayout:
     def read_sound(self) -> list[float]:
         """Return the present snapshot, with numbers from before where they are not finite."""
         return [new if isfinite(new) else old for new, old in zip(self.read(), self._start, strict=True)]
-
-    def apply(self, snapshot: Sequence[float]) -> None:
-        """Place all bodies as in a snapshot; raises ValueError when it is one of other bodies."""
-        values = list(snapshot)
-        if len(values) != self.size:
-            raise ValueError(f"a snapshot of {len(values)} numbers does not fit a world of {self.size}")
-        client, put_joints = self._client, self._client.resetJointStatesMultiDof
-        place = len(self._still_values)
-        if values[:place] != self._still_values:
-            for k, body in enumerate(self._still):
-                body.set_base_pose(client, _pose(values, 7 * k))
-            self._still_values = values[:place]
-        for body in self._moving:
-            if body.roams:
-                body.set_base_pose(client, _pose(values, place))
-                place += 7
-            if body.movable:
-                count = len(body.movable)
-                put_joints(body.id, body.movable, [[value] for value in values[place : place + count]])
-                place += count
-
-
-def _pose(values: Sequence[float], place: int) -> Transform:
-    return tuple(values[place : place + 3]), tuple(values[place + 3 : place + 7])

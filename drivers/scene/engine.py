@@ -234,6 +234,3 @@ class SceneEngine(WorldDriver, Generic[B]):
 
     def start_bodies(self, added: Sequence[B]) -> None:  # optional
         """Complete new bodies, which are now at their initial poses."""
-
-    def paint_body(self, body: B, rgba: list[float]) -> None:  # most engines draw nothing
-        """Change the colour of a body, where the engine itself draws."""

@@ -397,11 +397,10 @@ class SimulatedWorld(SceneEngine[B]):
 
     def set_color(self, name: str, rgba: Sequence[float]) -> int:
         """Set the colour of all links of a body (red, green, blue, alpha in 0..1) and return the new revision."""
-        body = self.body(name)
+        self.body(name)
         color = numbers("rgba", rgba, 4)
         if not all(0.0 <= value <= 1.0 for value in color):
             raise CommandError(f"rgba of {name!r} must be numbers in 0..1, not {color}")
-        self.paint_body(body, color)
         return self._publish_edit("set_color", name=name, rgba=color)
 
     def randomize(self, values: Mapping[str, Any], seed: int) -> int:

@@ -68,7 +68,6 @@ WITH_PAD = PANDA + "gamepads: {pad: {}}\n"
         (WITH_PAD, ["--pad", "keyboard"], "terminal"),
         (WITH_PAD, ["--pad", "web", "--set", "simulation.clock=lock_step"], "NotSupported: the console"),
         (REAL + "gamepads: {pad: {}}\n", ["--pad", "demo"], "cannot hold the dead-man of a real arm"),
-        (REAL + "gamepads: {pad: {}}\n", ["--viewer", "gui", "--pad", "web"], "no simulated world"),
         (WITH_PAD, ["--listen", "8470"], "--listen takes an address"),
         (WITH_PAD, ["--listen", "203.0.113.7"], "--listen: cannot listen at 203.0.113.7"),
         (WITH_PAD, ["--listen", "no.such.host.invalid"], "no.such.host.invalid"),

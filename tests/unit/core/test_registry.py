@@ -140,7 +140,7 @@ def test_an_error_in_a_drivers_own_code_is_not_hidden(lab: Path) -> None:
 
 
 def test_the_kinds_of_a_spec() -> None:
-    assert DriverSpec("x", camera="a:B", viewer="a:C").kinds == ("camera", "viewer")
+    assert DriverSpec("x", camera="a:B", leader="a:C").kinds == ("camera", "leader")
     assert DriverSpec("x").kinds == ()
 
 

@@ -267,9 +267,9 @@ def _config(node: ArkNode, reading: ArkReader, ledger: KeyReport) -> dict[str, A
     simulation: dict[str, Any] = {}
     mode = node.get("connection_mode")
     if mode is not None and str(mode.data).upper() == "DIRECT":
-        ledger.kept(mode, "", "no window opens unless --viewer gui asks for one")
+        ledger.kept(mode, "", "no window opens")
     else:
-        ledger.changed(mode, "", "a window is not part of a rig: --viewer gui opens it, in a process of its own")
+        ledger.changed(mode, "", "there is no window: --viewer 3d shows the world in a browser")
     frequency = node.get("sim_frequency")
     if frequency is not None:
         simulation["physics_hz"] = reading.number(frequency, positive=True)

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from specs import box, cube, data, floor, iiwa, panda, world_spec
 
 from hal.drivers.pybullet.world import PyBulletWorld
-from hal.errors import NotSupported
 from hal.geometry import Pose
-from hal.specs import BodySpec, to_json
+from hal.specs import BodySpec
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
@@ -53,45 +52,3 @@ def test_free_fall() -> None:
 def test_a_rate_at_which_contacts_give_way_is_a_warning() -> None:
     for rate, count in ((60.0, 1), (240.0, 0)):
         assert len(PyBulletWorld(world_spec(floor(), physics_hz=rate)).warnings) == count
-
-
-class TestMirror:
-    def assert_same(self, world: PyBulletWorld, mirror: PyBulletWorld) -> None:
-        assert mirror.names() == world.names()
-        for name in world.names():
-            assert mirror.describe(name) == world.describe(name)
-            for link in world.describe(name)["links"]:
-                a, b = world.pose(name, link), mirror.pose(name, link)
-                assert a["position"] == pytest.approx(b["position"], abs=1e-6), (name, link)
-                assert a["orientation"] == pytest.approx(b["orientation"], abs=1e-6), (name, link)
-
-    def test_shows_every_link_edits_and_fixed_bodies_that_were_moved(self) -> None:
-        world = scene()
-        mirror = PyBulletWorld(world.spec, mirror=True)
-        edits: list[tuple[str, dict[str, object]]] = [
-            ("add", {"spec": to_json(box("wall", (1, 1, 1), (0.1, 0.1, 0.1)))}),
-            ("remove", {"name": "lid"}),
-            ("set_color", {"name": "wall", "rgba": [1, 0, 0, 1]}),
-        ]
-        for method, params in edits:
-            assert world.request(method, params) == mirror.request(method, params)
-        world.set_pose("wall", {"position": [0.0, 2.0, 0.5]})
-        world.reset("panda", q=[0.5, -0.5, 0.2, -2.0, 0.1, 1.5, 0.5])
-        run(world, 30)
-        before = pose(mirror, "panda", "panda_hand")
-        mirror.show(world.snapshot())
-        assert pose(mirror, "panda", "panda_hand").distance(before)[0] > 0.1
-        assert pose(mirror, "wall").position.tolist() == [0.0, 2.0, 0.5]
-        self.assert_same(world, mirror)
-
-    def test_refuses_other_bodies_and_to_be_stepped(self) -> None:
-        world = scene()
-        mirror = PyBulletWorld(world.spec, mirror=True)
-        world.add(box("wall", (1, 1, 1), (0.1, 0.1, 0.1)))
-        with pytest.raises(ValueError, match="snapshot"):
-            mirror.show(world.snapshot())
-        with pytest.raises(NotSupported):
-            mirror.step()
-
-    def test_overlapping_arms_are_no_error_in_a_mirror(self) -> None:
-        PyBulletWorld(world_spec(panda("left"), panda("right")), mirror=True).close()
