@@ -1,6 +1,6 @@
 """``hal generate`` as a program: workers and the program itself are killed, and the rows are those of one worker.
 
-Two kills here; HAL_GENERATE_KILLS=20 does more.
+One kill here; HAL_GENERATE_KILLS=20 does more.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from recording_layout import check_layout
 from hal.recording import Dataset
 
 ROOT = Path(__file__).resolve().parents[2]
-KILLS = int(os.environ.get("HAL_GENERATE_KILLS", "2"))
+KILLS = int(os.environ.get("HAL_GENERATE_KILLS", "1"))
 EPISODES = 2 * KILLS + 1
 
 
@@ -160,6 +160,8 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
     own = {"node_ip_address": "127.0.0.1", "include_dashboard": False, "object_store_memory": 80_000_000}
     with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as ray:
+        monkeypatch.setenv("RAY_TMPDIR", ray)  # where a cluster leaves its address, in a folder that has to exist
+        (Path(ray) / "ray").mkdir()
         cluster = Cluster(True, head_node_args={**own, "num_cpus": 0, "temp_dir": ray})
         try:
             for name in ("node_0", "node_1"):
