@@ -1,6 +1,7 @@
-"""Show a dataset: its statistics, an episode as a picture or for the rerun viewer; check and repair it.
+"""Show a dataset: its statistics, a page to mark and delete, an episode as a picture or for rerun; check and repair it.
 
 hal review data/demo
+hal review data/demo --page
 hal review data/demo --episode 3
 hal review data/demo --episode 3 --rrd look.rrd
 hal review data/demo --check
@@ -15,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hal
 from hal.apps._common import ACTION_NEEDED, program
 from hal.apps._display import count_episodes
 from hal.errors import CommandError, DatasetError
@@ -30,6 +32,8 @@ LEAVE_OUT = (
     "docs/record.md describes how to remove the last one"
 )
 
+_COLOURS = Path(hal.__file__).with_name("drivers") / "web" / "page" / "base.css"
+"""Style of the console's page, which is that of the page of episodes."""
 _MARK = {True: "success", False: "failure", None: "-"}
 
 
@@ -38,8 +42,8 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="hal review",
         description="Show a dataset: its statistics, one episode as a picture or for rerun; check and repair it.",
-        epilog="The dataset is only read, except by --repair. The exit status is 2 if an episode cannot be read or "
-        "repaired, or --check finds a problem, else 0.",
+        epilog="The dataset is only read, except by --repair and the buttons of the page. "
+        "The exit status is 2 if an episode cannot be read or repaired, or --check finds a problem, else 0.",
     )
     made.add_argument("dataset", metavar="DATASET", help="the folder of a recording")
     made.add_argument(
@@ -48,13 +52,21 @@ def parser() -> argparse.ArgumentParser:
         metavar="N",
         help="only this episode, with a picture of it: images over time, joints, gripper, stops",
     )
-    made.add_argument("--png", metavar="FILE", help="file of the picture (default: beside the dataset)")
+    made.add_argument("--svg", metavar="FILE", help="file of the picture (default: beside the dataset)")
     made.add_argument(
         "--rrd", metavar="FILE", help="write a file for the rerun viewer instead; needs the extra [review]"
     )
     files = made.add_mutually_exclusive_group()
     files.add_argument(
         "--check", action="store_true", help="compare every file with the index: rows, images, depth, time stamps"
+    )
+    files.add_argument(
+        "--page",
+        type=int,
+        nargs="?",
+        const=0,
+        metavar="PORT",
+        help="serve a page to rank, look at, mark and delete episodes, to this computer only, until Ctrl-C",
     )
     files.add_argument(
         "--repair",
@@ -78,9 +90,11 @@ def main(args: argparse.Namespace) -> int:
     dataset = Dataset(args.dataset)
     if args.check:
         return _check(args, dataset)
+    if args.page is not None:
+        return _serve(args, dataset)
     if args.episode is None:
-        if args.png or args.rrd:
-            raise CommandError("--png and --rrd show one episode: select it with --episode N")
+        if args.svg or args.rrd:
+            raise CommandError("--svg and --rrd show one episode: select it with --episode N")
         found = summarize(dataset)
     else:
         (episode,) = select_episodes(dataset, [args.episode], successful_only=False)
@@ -102,8 +116,8 @@ def _check(args: argparse.Namespace, dataset: Dataset) -> int:
     from hal.recording.index import repair_command
     from hal.recording.layout import DatasetLayout
 
-    if args.png or args.rrd:
-        raise CommandError("--check cannot be used with --png or --rrd")
+    if args.svg or args.rrd:
+        raise CommandError("--check cannot be used with --svg or --rrd")
     wanted = None if args.episode is None else [args.episode]
     count = len(select_episodes(dataset, wanted, successful_only=False))
     found = list(dict.fromkeys(str(error) for error in check_dataset(dataset, wanted)))
@@ -116,11 +130,23 @@ def _check(args: argparse.Namespace, dataset: Dataset) -> int:
     return ACTION_NEEDED if found else 0
 
 
+def _serve(args: argparse.Namespace, dataset: Dataset) -> int:
+    from hal.recording.review_page import ReviewServer
+
+    if args.episode is not None or args.svg or args.rrd or args.json:
+        raise CommandError("--page is for the whole dataset and cannot be used with other options")
+    with ReviewServer(dataset.root, args.page, _COLOURS.read_bytes()) as server:
+        print(f"Open this in a browser; Ctrl-C ends it:\n\n    {server.link}\n", flush=True)
+        with suppress(KeyboardInterrupt):
+            server.serve_forever()
+    return 0
+
+
 def _repair(args: argparse.Namespace) -> int:
     from hal.recording import Dataset, repair
     from hal.recording.review import summarize
 
-    if args.episode is not None or args.png or args.rrd or args.json:
+    if args.episode is not None or args.svg or args.rrd or args.json:
         raise CommandError("--repair is for the whole dataset and cannot be used with other options")
     done, damaged = [], []
     try:
@@ -161,13 +187,13 @@ def _write_picture(args: argparse.Namespace, root: Path, episode: Episode) -> It
         with write_atomically(path, force=args.force, is_ours=Path.is_file) as new:
             write_rrd(episode, new)
         yield path
-    if args.png or not args.rrd:
+    if args.svg or not args.rrd:
         from hal.recording.review import draw_sheet
 
-        beside = root.with_name(f"{root.name}_episode_{episode.number:06d}.png")
-        path = Path(args.png or beside).expanduser().absolute()
+        beside = root.with_name(f"{root.name}_episode_{episode.number:06d}.svg")
+        path = Path(args.svg or beside).expanduser().absolute()
         with write_atomically(path, force=args.force, is_ours=Path.is_file) as new:
-            draw_sheet(episode).save(new, format="png")
+            new.write_text(draw_sheet(episode), encoding="utf-8")
         yield path
 
 

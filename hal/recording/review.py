@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from html import escape
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from ..errors import DatasetError
 from ..types import Limited, RobotStatus, Trip
@@ -26,58 +29,49 @@ Colour = tuple[int, int, int]
 BLACK: Colour = (30, 30, 30)
 GREY: Colour = (120, 120, 120)
 LIGHT: Colour = (225, 225, 225)
-_FINE = 3
-"""Scale at which shapes are drawn before they are scaled down, so that slanted lines are smooth."""
+_ANCHORS = {"l": "start", "m": "middle", "r": "end"}
+_RISE = {"a": 0.95, "m": 0.35, "s": 0.0}
+"""Distance of a text's baseline below the point that its anchor names, as a share of its size."""
 
 
 class SheetCanvas:
-    """A white picture to draw on with Pillow alone. Coordinates are in pixels from the upper left corner."""
+    """A white SVG picture. Coordinates are in pixels from the upper left corner."""
 
     def __init__(self, width: int, height: int) -> None:
-        self.width, self.height = width, height
-        self._fine = Image.new("RGB", (width * _FINE, height * _FINE), "white")
-        self._draw = ImageDraw.Draw(self._fine)
-        self._words: list[tuple[float, float, str, int, Colour, str]] = []
-        self._photos: list[tuple[int, int, Image.Image]] = []
+        size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}" font-family="sans-serif"'
+        self._parts = [f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']
+        self.box(0, 0, width, height, (255, 255, 255))
 
     def line(self, points: Sequence[tuple[float, float]], colour: Colour, width: float = 1.0) -> None:
         """Draw a line from point to point."""
-        if len(points) > 1:
-            fine = [(x * _FINE, y * _FINE) for x, y in points]
-            self._draw.line(fine, fill=colour, width=round(width * _FINE), joint="curve")
+        places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+        self._parts.append(f'<polyline points="{places}" fill="none" stroke="rgb{colour}" stroke-width="{width}"/>')
 
     def box(self, x: float, y: float, width: float, height: float, colour: Colour) -> None:
         """Draw a filled rectangle, at least one pixel wide."""
-        right, bottom = x + max(1.0, width), y + max(1.0, height)
-        self._draw.rectangle((x * _FINE, y * _FINE, right * _FINE - 1, bottom * _FINE - 1), fill=colour)
+        size = f'width="{max(1.0, width):.1f}" height="{max(1.0, height):.1f}"'
+        self._parts.append(f'<rect x="{x:.1f}" y="{y:.1f}" {size} fill="rgb{colour}"/>')
 
     def text(self, x: float, y: float, words: str, size: int = 13, colour: Colour = BLACK, anchor: str = "la") -> None:
-        """Draw a text; ``anchor`` is Pillow's: left, middle or right, then ascender, middle or baseline."""
-        self._words.append((x, y, words, size, colour, anchor))
+        """Draw a text; ``anchor``: left, middle or right (l, m, r), then ascender, middle or baseline (a, m, s)."""
+        place = f'x="{x:.1f}" y="{y + _RISE[anchor[1]] * size:.1f}" text-anchor="{_ANCHORS[anchor[0]]}"'
+        self._parts.append(f'<text {place} font-size="{size}" fill="rgb{colour}">{escape(words)}</text>')
 
     def photo(self, x: int, y: int, picture: NDArray[np.uint8], width: int, height: int) -> None:
         """Draw a picture (H, W, 3) RGB, scaled."""
-        image = Image.fromarray(picture).resize((width, height), Image.Resampling.BOX)
-        self._photos.append((x, y, image))
+        data = io.BytesIO()
+        Image.fromarray(picture).resize((width, height), Image.Resampling.BOX).save(data, "jpeg", quality=85)
+        source = f"data:image/jpeg;base64,{base64.b64encode(data.getvalue()).decode()}"
+        self._parts.append(f'<image x="{x}" y="{y}" width="{width}" height="{height}" href="{source}"/>')
 
     @staticmethod
     def length(words: str, size: int = 13) -> float:
-        """Return the width of a text, pixels."""
-        return float(_font(size).getlength(words))
+        """Return about the width of a text, pixels."""
+        return 0.56 * size * len(words)
 
-    def image(self) -> Image.Image:
-        """Return the picture."""
-        image = self._fine.resize((self.width, self.height), Image.Resampling.BOX)
-        for left, top, photo in self._photos:
-            image.paste(photo, (left, top))
-        draw = ImageDraw.Draw(image)
-        for x, y, words, size, colour, anchor in self._words:
-            draw.text((x, y), words, fill=colour, font=_font(size), anchor=anchor)
-        return image
-
-
-def _font(size: int) -> Any:
-    return ImageFont.load_default(size)
+    def image(self) -> str:
+        """Return the picture as SVG."""
+        return "\n".join([*self._parts, "</svg>"])
 
 
 def ticks(low: float, high: float, most: int) -> list[float]:
@@ -97,6 +91,8 @@ def ticks(low: float, high: float, most: int) -> list[float]:
 
 _WATCHED = ("robot.", "gripper.", "camera.")
 """Sources that measure continuously; a pad reports only changes."""
+_IDLE = 0.02
+"""Speed, rad/s; that of :func:`~.curation.find_motion`."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +138,10 @@ class EpisodeSummary:
     trouble: str
     pace: float | None
     """Pace of a simulation as a share of real time; None in lock-step, and without a simulation."""
+    jerk: float
+    """Root mean square of the jerk of all joints' set-points, rad/s3; NaN for fewer than four rows."""
+    idle: float
+    """Share of the rows in which no joint's set-point is faster than 0.02 rad/s."""
 
 
 @dataclass(frozen=True)
@@ -220,6 +220,7 @@ def _line(episode: Episode) -> EpisodeSummary:
         if name.split(".")[-1] == "trip":
             tripped = status[:, k] != 0
             trips += int(tripped[0]) + int(np.sum(tripped[1:] & ~tripped[:-1]))
+    jerk, idle = _measure_motion(episode)
     return EpisodeSummary(
         number=episode.number,
         rows=episode.length,
@@ -230,7 +231,19 @@ def _line(episode: Episode) -> EpisodeSummary:
         task=episode.task,
         trouble=str(episode.info.get("trouble") or ("recovered" if episode.info.get("recovered") else "")),
         pace=simulated_pace(episode.info),
+        jerk=jerk,
+        idle=idle,
     )
+
+
+def _measure_motion(episode: Episode) -> tuple[float, float]:
+    """Return the jerk and the idle share of an episode, see :class:`EpisodeSummary`."""
+    content = EpisodeContent(episode)
+    joints = np.concatenate([content.of(arm, SETPOINT) for arm in content.arms], axis=1).astype(np.float64)
+    jerks = np.diff(joints, 3, axis=0) * episode.fps**3
+    fastest = np.abs(np.diff(joints, axis=0)).max(axis=1, initial=0.0) * episode.fps
+    jerk = float(np.sqrt(np.mean(jerks**2))) if jerks.size else math.nan
+    return jerk, float(np.mean(fastest <= _IDLE)) if fastest.size else 1.0
 
 
 def _spreads(names: list[str], parts: Sequence[NDArray[Any]]) -> list[ColumnSpread]:
@@ -304,8 +317,8 @@ class _Run(NamedTuple):
     value: int
 
 
-def draw_sheet(episode: Episode) -> Image.Image:
-    """Return the sheet of an episode, 1600 pixels wide. Errors are those of reading the episode."""
+def draw_sheet(episode: Episode) -> str:
+    """Return the sheet of an episode as SVG, 1600 pixels wide. Errors are those of reading the episode."""
     content = EpisodeContent(episode)
     streams = [stream for stream in content.pictures if stream.what == "rgb"]
     curves = list(_curves(content))

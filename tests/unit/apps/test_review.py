@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from app_kit import Done, run_here
-from PIL import Image
 from recording_kit import join_metadata, make_recording
 
 from hal.apps import export, review
@@ -38,24 +38,22 @@ def test_a_dataset_is_a_table(folder: Path) -> None:
 
 
 def test_an_episode_is_a_picture(folder: Path, tmp_path: Path) -> None:
-    path = tmp_path / "look.png"
-    done = run(folder, "--episode", "1", "--png", path, "--json")
+    path = tmp_path / "look.svg"
+    done = run(folder, "--episode", "1", "--svg", path, "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["episodes"][0]["number"] == 1, "only JSON on the standard output"
     assert f"wrote {path}" in done.stderr
-    with Image.open(path) as image:
-        image.load()
-        assert image.size[0] == 1600
-    again = run(folder, "--episode", "1", "--png", path)
+    assert ElementTree.parse(path).getroot().get("width") == "1600"
+    again = run(folder, "--episode", "1", "--svg", path)
     assert again.returncode == 2
     assert "--force" in again.stderr
-    beside = folder.with_name("demo_episode_000002.png")
+    beside = folder.with_name("demo_episode_000002.svg")
     assert f"wrote {beside}" in run(folder, "--episode", "2").stdout
     assert beside.is_file()
 
 
 def test_a_mistake_is_a_message(folder: Path) -> None:
-    for wrong, says in ((("--episode", "7"), "no episode 7"), (("--png", "x.png"), "with --episode")):
+    for wrong, says in ((("--episode", "7"), "no episode 7"), (("--svg", "x.svg"), "with --episode")):
         done = run(folder, *wrong)
         assert done.returncode == 2
         assert says in done.stderr

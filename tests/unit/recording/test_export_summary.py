@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from PIL import Image
 from recording_kit import make_recording
 
 from hal.recording import Dataset
@@ -78,24 +83,31 @@ def test_json_has_no_number_that_json_does_not_have(dataset: Dataset) -> None:
 # The sheet.
 
 
-def has(image: np.ndarray, colour: tuple[int, int, int]) -> int:
-    """How many pixels have it."""
-    return int((image == colour).all(axis=2).sum())
-
-
 def test_the_sheet_shows_pictures_curves_and_stops(dataset: Dataset) -> None:
-    stopped, calm = (np.asarray(draw_sheet(dataset.episodes[k])) for k in (0, 1))
-    assert stopped.shape == calm.shape
-    assert stopped.shape[1] == 1600
-    for image in (stopped, calm):
-        assert has(image, BLUE) > 500
-        assert has(image, ORANGE) > 500
-    assert has(stopped, RED) > 1000
-    assert has(stopped, PINK) > 10_000
-    assert has(calm, RED) == has(calm, PINK) == 0
+    stopped, calm = (draw_sheet(dataset.episodes[k]) for k in (0, 1))
+    for sheet in (stopped, calm):
+        root = ElementTree.fromstring(sheet)
+        assert root.get("width") == "1600"
+        lines = [each.get("stroke") for each in root.iter("{http://www.w3.org/2000/svg}polyline")]
+        assert lines.count(f"rgb{BLUE}") >= 8, "every joint and the gripper"
+        assert lines.count(f"rgb{ORANGE}") >= 8
+    assert f"rgb{RED}" in stopped
+    assert f"rgb{PINK}" in stopped
+    assert f"rgb{RED}" not in calm
+    assert f"rgb{PINK}" not in calm
+    data = base64.b64decode(re.findall(r"base64,([^\"]+)", stopped)[0])
     first = next(dataset.episodes[0].frames("scene"))
-    corner = stopped[104 + 18 + 8, 40 + 8].astype(int)
-    assert np.abs(corner - first[1:5, 1:5].mean(axis=(0, 1))).max() < 25, "the first picture is the upper left one"
+    corner = np.asarray(Image.open(io.BytesIO(data)))[8, 8].astype(int)
+    assert np.abs(corner - first[1:5, 1:5].mean(axis=(0, 1))).max() < 25, "the first picture comes first"
+
+
+def test_jerk_and_idle_time_rank_episodes(dataset: Dataset) -> None:
+    line = summarize(dataset, [dataset.episodes[1]]).episodes[0]
+    joints = dataset.episodes[1].columns["rig.setpoint"][:, :7].astype(float)
+    steps = np.diff(joints, axis=0)
+    assert line.idle == pytest.approx(np.mean(np.abs(steps).max(axis=1) * dataset.fps <= 0.02))
+    assert line.jerk == pytest.approx(np.sqrt(np.mean((np.diff(steps, 2, axis=0) * dataset.fps**3) ** 2)))
+    assert line.jerk > 0.0
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def replayed(episode: Episode, folder: Path, rig: Rig) -> Arrays:
 
 
 def drawn(episode: Episode, folder: Path, rig: Rig) -> Arrays:
-    return {"sheet": np.asarray(draw_sheet(episode))}
+    return {"sheet": np.array(draw_sheet(episode))}
 
 
 READERS = (rows, pictures, exported, replayed, drawn)
