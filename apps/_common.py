@@ -398,10 +398,6 @@ def find_pad(rig: Rig, robot: Robot | None = None) -> Gamepad | None:
 def find_deadman(rig: Rig, robot: Robot | None = None) -> tuple[Deadman, TeleopMapping, str]:
     """Return the dead-man of the rig's pad, the pad's mapping, and the name of the dead-man's control.
 
-    Args:
-        rig: Open rig.
-        robot: Arm that is led in a takeover; None if no leader is needed.
-
     Raises:
         CommandError: The rig has no pad (code ``no_gamepad``), or its pad's controls cannot be held (``cannot_hold``).
     """
@@ -459,11 +455,6 @@ def program(parser: Callable[[], argparse.ArgumentParser]) -> Callable[[Callable
 
 def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) -> int:
     """Parse the command line and run ``main(args)``; an error that the user can fix is a message, not a traceback.
-
-    Args:
-        main: Function of the parsed options that returns the exit status.
-        parser: Its ``prog`` is the command, such as ``hal teleop``.
-        argv: Arguments; None for those of the process.
 
     Returns:
         The exit status. The output is written by then, or known to be lost.

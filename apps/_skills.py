@@ -53,10 +53,7 @@ def add_skill_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGrou
 def run_skill(args: argparse.Namespace, what: str, act: Callable[[SkillApp], SkillResult | None]) -> int:
     """Open the rig that the options name, run a skill on it, and print how it ended.
 
-    Args:
-        args: Options of :func:`add_skill_options`.
-        what: Line for the banner.
-        act: Finds the object and runs the skill; returns None if no object was found.
+    ``act`` returns None if no object was found.
 
     Returns:
         The exit status.

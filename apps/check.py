@@ -102,11 +102,7 @@ _REAL = ("auto", "evdev")
 
 
 def show_pads(specs: Sequence[PadSpec], duration: float | None) -> bool:
-    """Show pads as they come and go.
-
-    Args:
-        specs: Pads of a rig; if empty, all that are plugged in are shown.
-        duration: Time to show them, s; None until Ctrl-C.
+    """Show these pads, or all that are plugged in, as they come and go; for ``duration`` s, or until Ctrl-C.
 
     Returns:
         Whether there was a pad that can be read.

@@ -111,10 +111,6 @@ def _dataset_info(checkpoint: Path, dataset: str | None) -> dict[str, Any]:
 def describe(info: Mapping[str, Any], inputs: Collection[str]) -> dict[str, Any]:
     """Return what a client needs to know: the joints, and a policy configuration.
 
-    Args:
-        info: ``meta/info.json`` of the recording.
-        inputs: Names of the features that the policy uses.
-
     Raises:
         CommandError: The policy uses other columns than the state, the poses of objects and the pictures (code
             ``unknown_input``), or the recording is of another program (``foreign_dataset``).
@@ -172,12 +168,7 @@ class LeRobotPolicy:
     """A checkpoint of LeRobot, with its own processing before and after the network."""
 
     def __init__(self, checkpoint: Path, device: str, rtc: bool = False) -> None:
-        """Load a checkpoint.
-
-        Args:
-            checkpoint: Folder of the checkpoint.
-            device: Device of torch, or ``auto``.
-            rtc: Whether a chunk continues the one before (real-time chunking).
+        """Load a checkpoint; ``rtc`` lets a chunk continue the one before.
 
         Raises:
             DriverMissing: LeRobot is not installed.

@@ -405,10 +405,6 @@ class CameraCounts(NamedTuple):
 def find_place(spec: CameraSpec, robots: Mapping[str, Robot]) -> Place | None:
     """Return the pose of the colour sensor's optical frame in the world as a function of time.
 
-    Args:
-        spec: Record of the camera; its view is fixed in the world, or on the link of an arm.
-        robots: The rig's arms, by name.
-
     Returns:
         The function, for :class:`Camera`; None if the rig file does not place the camera.
     """

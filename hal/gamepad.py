@@ -315,12 +315,6 @@ class NeutralGate:
     ) -> frozenset[str]:
         """Take a state of the connected pad.
 
-        Args:
-            axes: Axis -> value.
-            buttons: Buttons that are pressed.
-            unknown: Axes that the pad has not reported yet.
-            absolute: Axes that do not spring back.
-
         Returns:
             The buttons that count; :attr:`ignored` has the axes that do not.
         """

@@ -130,10 +130,6 @@ class Pose:
 def tcp_pose(name: str, pose: object) -> Pose:
     """Return ``pose`` if it has both a position and an orientation, as a target of a tcp must have.
 
-    Args:
-        name: Name of the argument, for the message.
-        pose: The argument.
-
     Raises:
         CommandError: Not a :class:`Pose` (``code`` is ``not_a_pose``), or one without an orientation
             (``no_orientation``).

@@ -24,11 +24,6 @@ NEWER = 0.05
 def robot_at(history: History[RobotState], t: float, name: str) -> RobotState:
     """Return an arm's state at a time: numbers interpolated linearly, everything else from the state before.
 
-    Args:
-        history: States of the arm.
-        t: Time on ``rig.clock``, s.
-        name: Name of the arm, for the message.
-
     Raises:
         StaleStateError: ``t`` is older than the history, or newer than the newest state by more than 50 ms.
     """
@@ -60,11 +55,6 @@ def robot_at(history: History[RobotState], t: float, name: str) -> RobotState:
 
 def gripper_at(history: History[GripperState], t: float, name: str) -> GripperState:
     """Return a gripper's state at a time: its width interpolated, everything else from the state before.
-
-    Args:
-        history: States of the gripper.
-        t: Time on ``rig.clock``, s.
-        name: Name of the gripper, for the message.
 
     Raises:
         StaleStateError: As for :func:`robot_at`.

@@ -221,10 +221,7 @@ def _own_name(role: str) -> str:
 
 
 class Credentials:
-    """This end's certificate, and what it demands of the other end.
-
-    Args:
-        role: This end's: ``host`` (which listens) or ``person`` (who connects).
+    """This end's certificate, and what it demands of the other end. A ``host`` listens, a ``person`` connects.
 
     Raises:
         NotSupported: There is no usable certificate here; as :func:`find_key`, or it is damaged (``bad_certificate``).

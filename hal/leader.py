@@ -48,12 +48,7 @@ class Angles(NamedTuple):
 
 
 class LeaderDriver(GamepadDriver):
-    """Driver of one leader arm. It never moves a motor, and never writes to one, unless it shall follow the arm.
-
-    Args:
-        spec: Record of the leader, with :attr:`~hal.specs.PadSpec.leader`.
-        source: Unused.
-    """
+    """Driver of one leader arm. It never moves a motor, and never writes to one, unless it shall follow the arm."""
 
     proves_liveness = True
 
@@ -191,9 +186,7 @@ class LeaderDriver(GamepadDriver):
 class Leader(Gamepad):
     """A leader arm of a rig. Its state has the buttons of the gamepad that is its dead-man, its own lever, and joints.
 
-    Args:
-        driver: Driver of the leader.
-        guard: The gamepad that is its dead-man; beside a lever that is, one for the other buttons; or None.
+    ``guard`` is that gamepad; beside a lever that is the dead-man, one for the other buttons; or None.
     """
 
     def __init__(self, driver: LeaderDriver, guard: Gamepad | None = None) -> None:

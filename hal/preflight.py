@@ -236,14 +236,7 @@ def compare_tcp(distance: float, turn: float, remedy: str) -> CheckResult:
 def compare_payload(
     wanted: tuple[float, Sequence[float]] | None, mass: float, com: Sequence[float], place: str
 ) -> CheckResult:
-    """Compare the payload that an arm's controller has with the rig's.
-
-    Args:
-        wanted: The rig's mass, kg, and centre of mass, m; None to leave the controller's.
-        mass: The controller's, kg.
-        com: Its centre of mass, m.
-        place: Where the controller has it, in words.
-    """
+    """Compare a controller's payload, kg and m, with the rig's; None keeps the controller's."""
     found = f"{mass:.2f} kg at [{', '.join(f'{value:.3f}' for value in com)}] m in {place}"
     if wanted is None:
         return CheckResult("payload", "ok", f"{found}; real.load is not set, so it stays")

@@ -101,11 +101,7 @@ class _VariedWorld(Protocol):
 
 
 class Randomizer:
-    """Applies drawn values to a world, and restores what the rig file says.
-
-    Args:
-        spec: Record of the world.
-    """
+    """Applies drawn values to a world, and restores what the rig file says."""
 
     def __init__(self, spec: WorldSpec | None) -> None:
         self._spec = spec.randomize if spec is not None else None

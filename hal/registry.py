@@ -278,10 +278,6 @@ def versions(name: str) -> dict[str, str]:
 def load(name: str, kind: str) -> Any:
     """Return the class that a driver has for a kind of device.
 
-    Args:
-        name: Name of the driver, or place of its spec.
-        kind: ``robot``, ``gripper``, ``camera``, ``gamepad``, ``world``, ...
-
     Raises:
         DeviceNotFound: No such driver.
         NotSupported: The driver has no such kind; lists what it has.
@@ -328,10 +324,6 @@ def find_missing(name: str, device: object = None) -> dict[str, str]:
     """Return the libraries that a driver needs and that are not installed -> the command that installs each.
 
     Imports none of them, so a program can report what is missing before it opens anything.
-
-    Args:
-        name: The driver.
-        device: Record of a device, to name only what this one needs.
     """
     spec = driver(name)
     choose = None if device is None else function(name, spec.libraries)

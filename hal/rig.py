@@ -482,12 +482,6 @@ class Rig:
 def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> list[Chosen]:
     """Choose the pads, and check what can be checked before a device or a process is opened.
 
-    Args:
-        plan: The resolved rig.
-        pad: As in :func:`open_rig`.
-        viewer: As in :func:`open_rig`.
-        console: As in :func:`open_rig`.
-
     Returns:
         The pads to open.
 
@@ -537,11 +531,7 @@ def _check_leaders(plan: Plan, pads: Sequence[Chosen]) -> None:
 
 
 class Devices(dict[str, T]):
-    """Devices by name. An unknown name raises DeviceNotFound, which lists the known ones.
-
-    Args:
-        kind: Word for the devices in messages, ``robot`` for example; with an s it is the rig's attribute.
-    """
+    """Devices by name. An unknown name raises DeviceNotFound, which lists the known ones."""
 
     def __init__(self, kind: str) -> None:
         super().__init__()

@@ -35,12 +35,8 @@ FRAMES = ("base", "tcp")
 class Console(ABC):
     """A page in a browser that displays a rig and, as a gamepad, drives it; and its server.
 
-    ``wait_ready`` is called once and first; everything else may be called from any thread.
-
-    Args:
-        rig: The rig.
-        listen: Where to listen.
-        driven_by: Description of the pad that drives, if it is not the page: the page then only displays and stops.
+    With ``driven_by``, the pad that drives if it is not the page, the page only displays and stops. ``wait_ready`` is
+    called once and first; everything else may be called from any thread.
     """
 
     notes: tuple[str, ...] = ()
@@ -260,13 +256,7 @@ class WorldView(ABC):
 
     @abstractmethod
     def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
-        """Repeat an edit of the world before a snapshot of that revision is displayed.
-
-        Args:
-            method: Method of :class:`hal.world.World`.
-            params: Its parameters.
-            revision: Revision of the world after the edit.
-        """
+        """Repeat an edit of the world before a snapshot of that revision is displayed."""
 
     @abstractmethod
     def describe(self) -> str:
@@ -278,13 +268,7 @@ class WorldView(ABC):
 
 
 class CameraRenderer(WorldView):
-    """The renderer of all simulated cameras of a world.
-
-    Args:
-        host: Process of the world.
-        cameras: Records of the cameras.
-        renderer: Renderer that the rig file names.
-    """
+    """The renderer of all simulated cameras of a world."""
 
     def __init__(self, host: Host, cameras: Sequence[CameraSpec], renderer: str) -> None:
         self.host = host
@@ -300,11 +284,7 @@ class CameraRenderer(WorldView):
 
 
 class Viewer3D(WorldView):
-    """A rig's arms in 3D on the console's page, with a draggable handle on each tcp.
-
-    Args:
-        rig: The rig.
-    """
+    """A rig's arms in 3D on the console's page, with a draggable handle on each tcp."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig

@@ -472,9 +472,6 @@ class WorldDriver(ABC):
     ``restore``        ``state``                               none
     =================  ======================================  ========================================================
 
-    Args:
-        spec: Record of the world.
-
     Raises:
         ConfigError: Something in the record cannot be loaded; lists every problem.
         DriverMissing: The physics engine is not installed.
@@ -525,10 +522,6 @@ class WorldDriver(ABC):
     @abstractmethod
     def request(self, method: str, params: Mapping[str, Any]) -> Any:
         """Serve one of :attr:`REQUESTS`.
-
-        Args:
-            method: Name of the request.
-            params: Its parameters, as JSON.
 
         Returns:
             Its result, as JSON.

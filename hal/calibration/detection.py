@@ -76,11 +76,6 @@ class CalibrationImage(NamedTuple):
 def select_image(frame: Frame, info: CameraInfo, align: str) -> CalibrationImage:
     """Return the colour image of a frame, or the infrared one if there is no colour.
 
-    Args:
-        frame: A frame of the camera.
-        info: The camera's description.
-        align: View that colour is returned in, ``color`` or ``depth``.
-
     Raises:
         NoView: The frame has neither image.
     """

@@ -198,15 +198,7 @@ class Context:
     def choose_driver(
         self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None = None
     ) -> str:
-        """Return the name of a device's driver and keep it in :attr:`drivers`; "" and a problem if there is none.
-
-        Args:
-            kind: ``robot``, ``gripper`` or ``camera``.
-            key: The device's key in the rig.
-            config: The device's entry.
-            model: Its model.
-            parent: The arm of a gripper.
-        """
+        """Return the name of a device's driver and keep it in :attr:`drivers`; "" and a problem if there is none."""
         with suppress(Unknown):
             name = self.driver or self._find_driver(kind, key, config, model, parent)
             if name is not None and self.check_driver(name, kind, key):
@@ -259,14 +251,7 @@ INSTALL = {
 
 
 def load_arm(model: RobotModel, file: Path, problems: Problems, warnings: list[str]) -> UrdfModel | None:
-    """Return the checked URDF of an arm with its tool; None, and the problems, if something in it is wrong.
-
-    Args:
-        model: The arm's model.
-        file: The model's file.
-        problems: Gets the problems.
-        warnings: Gets a warning about links without mass.
-    """
+    """Return the checked URDF of an arm with its tool; None, and the problems, if something in it is wrong."""
     freed = getattr(model, "freed", ())
     tool = model.tool
     if tool is None and not freed:
@@ -296,13 +281,7 @@ def load_urdf(
 ) -> UrdfModel | None:
     """Return a checked URDF; None, and a problem, if it is missing or wrong. Imports no package.
 
-    Args:
-        source: The path or the package that names it.
-        base: Folder that a path is relative to.
-        file: The file that names it, and ``key`` its key there, for the problems.
-        key: See ``file``.
-        problems: Gets the problems.
-        warnings: Gets a warning about links without mass.
+    A path is relative to ``base``; problems name ``file`` and ``key``. Links without mass are warnings.
     """
     path = _locate(source, base, file, key, problems, (".urdf",))
     if path is None:
@@ -395,16 +374,7 @@ def is_emulated(driver: str, options: Mapping[str, Any]) -> bool:
 def check_robot_spec(
     context: Context, key: str, spec: RobotSpec, config: RobotConfig, model: RobotModel, file: Path
 ) -> None:
-    """Add the problems that the drivers of an arm and of its gripper find in their records.
-
-    Args:
-        context: Gets the problems.
-        key: The arm's key in the rig.
-        spec: The arm's record.
-        config: The arm's entry in the rig.
-        model: The arm's model.
-        file: The model's file.
-    """
+    """Add the problems that the drivers of an arm and of its gripper find in their records."""
     _add(context, key, "", registry.check_record(spec.driver, "robot", spec), config, model, file)
     gripper, kind = spec.gripper, model.gripper
     if gripper is None or kind is None:

@@ -43,14 +43,7 @@ class Problems:
         """File and dotted key as it should be spelt -> the last part of that key as the file spells it."""
 
     def add(self, file: Path | str, key: str, message: str, code: str) -> None:
-        """Add a problem. One in a key that an override set is reported in ``--set`` instead of the file.
-
-        Args:
-            file: The file, or a description such as ``<dict>``.
-            key: Dotted key in it; empty for the whole file.
-            message: The problem, and what would be right.
-            code: Stable identifier of the kind of problem (see the module's docstring).
-        """
+        """Add a problem. One in a key that an override set is reported in ``--set`` instead of the file."""
         right = key.split(".")
         key = ".".join(self.written.get((str(file), ".".join(right[: k + 1])), part) for k, part in enumerate(right))
         by_override = any(key == path or key.startswith(path + ".") for path in self.overridden)
@@ -223,13 +216,6 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
     A value with a problem is a hole in the record: reading it raises :class:`~hal.config.schema.Unknown`. An unknown
     key is taken for the nearest known one that is not given: so a misspelt key is not reported as missing as well, and
     its value is checked, too.
-
-    Args:
-        model: The class of the record.
-        data: Nested dicts, lists, texts and numbers.
-        file: Where the data are from, for the problems.
-        problems: Gets the problems.
-        prefix: Dotted key of the data in the file.
     """
     data = copy_plain(data)
     guessed: set[Place] = set()
@@ -309,15 +295,7 @@ def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folde
 
 
 def find_file(given: str | Path, kind: str, base: Path, folder: str, *parts: str) -> Path | str:
-    """Return the path of a YAML file, or a message if there is none.
-
-    Args:
-        given: A path, or the name of a built-in file.
-        kind: What the file is, for the message.
-        base: Folder that a path is relative to.
-        folder: Data folder of the built-in files.
-        parts: Folders below it.
-    """
+    """Return the path of a YAML file, or a message if there is none."""
     name = str(given)
     if isinstance(given, Path) or is_path(name):
         return user_path(given, base)
@@ -435,13 +413,7 @@ SECTIONS = {"robots": "robot", "cameras": "camera", "leaders": "leader", "gamepa
 def apply_overrides(
     data: dict[str, Any], overrides: Sequence[str] | Mapping[str, Any], problems: Problems
 ) -> dict[str, Any]:
-    """Return a copy of the rig's data with the overrides in it.
-
-    Args:
-        data: The rig as its file has it.
-        overrides: ``"KEY=VALUE"`` with dotted keys and the values in YAML, or a mapping from dotted keys to values.
-        problems: Gets the problems in the form of the overrides.
-    """
+    """Return a copy of the rig's data with the overrides in it."""
     result = copy_plain(data)
     for key, value in _pairs(overrides, problems):
         _put(result, key, value, problems)

@@ -142,10 +142,7 @@ class TeleopMapping(Strict):
 
 
 def load_mapping(mapping: str | Path | Mapping[str, Any] | TeleopMapping = "default") -> TeleopMapping:
-    """Return a checked mapping.
-
-    Args:
-        mapping: The path of a file, the name of a built-in mapping, a dict with the same keys, or a mapping.
+    """Return a checked mapping, from a file, the name of a built-in one, a dict with the same keys, or a mapping.
 
     Raises:
         ConfigError: It has problems; all are listed.

@@ -158,13 +158,8 @@ class ObjectConfig(Strict):
 def load_objects(context: Context, entries: Sequence[Any], section: str, taken: dict[str, str]) -> tuple[BodySpec, ...]:
     """Return objects of a rig. Problems are added to ``context``; then the objects may be incomplete.
 
-    The robots of the rig have been resolved before, so that their URDFs and other names of links are known.
-
-    Args:
-        context: The rig.
-        entries: The objects as written.
-        section: Key of the list of them.
-        taken: Names of the rig's robots and other objects, each with its place in words; the new ones are added.
+    The robots of the rig have been resolved before, so that their URDFs and other names of links are known. ``taken``
+    has the names of robots and other objects, each with its place in words; the new ones are added.
     """
     bodies = []
     problems, source = context.problems, context.source

@@ -32,15 +32,7 @@ def resolve_randomize(
     bodies: Sequence[BodySpec],
     taken: dict[str, str],
 ) -> RandomizeSpec | None:
-    """Return what varies in a rig's world; None if nothing does, or with problems, which are added.
-
-    Args:
-        context: The rig.
-        robots: Its arms.
-        cameras: Its cameras.
-        bodies: Its objects.
-        taken: Names of robots and objects, see :func:`.objects.load_objects`.
-    """
+    """Return what varies in a rig's world; None if nothing does, or with problems, which are added."""
     config = context.rig.simulation.randomize
     if config is None:
         return None

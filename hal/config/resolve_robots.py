@@ -328,19 +328,9 @@ def resolve_limits(
     real: bool,
     problems: Problems,
 ) -> LimitsSpec:
-    """Return the limits that the servo keeps.
+    """Return the limits that the servo keeps; a real arm's by its ``real_limits`` and :data:`MOST_REAL`, too.
 
     Unknown limits are NaN, so comparisons with them are always false; a problem is added for each of them.
-
-    Args:
-        model: The arm's model.
-        urdf: Its URDF; None if that could not be read.
-        file: The model's file.
-        config: The arm's entry in the rig.
-        source: The rig's file.
-        key: Key of the entry's limits in it.
-        real: Whether the arm is real: then the model's ``real_limits`` and :data:`MOST_REAL` apply.
-        problems: Gets the problems.
 
     Raises:
         Unknown: The number of joints is unknown.
@@ -374,17 +364,7 @@ def resolve_limits(
 def spread(
     values: Floats, n: int, file: Path | str, key: str, unit: str, problems: Problems, *, one_for_all: bool = False
 ) -> Floats | None:
-    """Return one number for each of ``n`` joints; None, with a problem added, if ``values`` has another count.
-
-    Args:
-        values: (n,), or (1,) with ``one_for_all``.
-        n: Number of joints.
-        file: File of the values, for the problem.
-        key: Their key in it.
-        unit: Their unit.
-        problems: Gets the problem.
-        one_for_all: Whether one number stands for all joints.
-    """
+    """Return one number for each of ``n`` joints; None, with a problem added, if ``values`` has another count."""
     if one_for_all and len(values) == 1:
         return values * n
     if len(values) != n:

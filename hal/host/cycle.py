@@ -144,13 +144,7 @@ class ArmUnit:
         self.error = ConnectionLost(f"{self.spec.name}: {type(error).__name__}: {error}")
 
     def tick(self, now: float, app: AppRecord, late: bool = False) -> None:
-        """Compute the next set-point; first write the one that was computed ahead.
-
-        Args:
-            now: Time on the group's clock, s.
-            app: The app's newest record.
-            late: Whether this process could not run for a while.
-        """
+        """Compute the next set-point; first write the one that was computed ahead."""
         said = self.mail.get_session()
         if said.session != self._session:
             self.servo.close_session()
@@ -387,13 +381,7 @@ class Cycle:
     """A group: its world, if any, its arms and its grippers."""
 
     def __init__(self, spec: GroupSpec, memory: GroupMemory, others: Iterable[GroupMemory] = ()) -> None:
-        """Load the drivers; nothing is opened.
-
-        Args:
-            spec: The group.
-            memory: Its mailboxes.
-            others: Memories of the rig's other groups, whose arms are copied into this group's world, or kept off.
-        """
+        """Load the drivers; nothing is opened."""
         self.spec = spec
         self.memory = memory
         others = list(others)
@@ -454,13 +442,7 @@ class Cycle:
                 unit.driver.wait()
 
     def step(self, now: float, app: AppRecord, late: bool = False) -> None:
-        """Run one cycle.
-
-        Args:
-            now: Time on the group's clock, s.
-            app: The app's newest record.
-            late: Whether this process could not run for a while.
-        """
+        """Run one cycle."""
         self.ticks += 1
         self.t = now
         if self.world is not None:

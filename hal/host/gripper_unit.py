@@ -20,10 +20,7 @@ _SWITCH_ON = "check that it is on and connected"
 class GripperUnit:
     """A gripper with its mailboxes. Its errors are reported in its state and stop nothing else.
 
-    Args:
-        driver: The driver.
-        mail: Its mailboxes.
-        allowed_session: Returns the session of the arm that may move at a time (s), 0 for none.
+    ``allowed_session`` returns the session of the arm that may move at a time (s), 0 for none.
     """
 
     def __init__(
@@ -75,10 +72,6 @@ class GripperUnit:
         """Stop the fingers if the app stopped the rig, or they may not move any more; start the app's newest command.
 
         A command that was sent before a stop, or that the gripper does not accept, is dropped: nothing moves later.
-
-        Args:
-            now: Time on the group's clock, s.
-            app: The app's newest record.
         """
         if app.stops != self._stops:
             self._stops = app.stops

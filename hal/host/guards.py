@@ -121,11 +121,6 @@ class _ArmHere:
 def guard_arms(group: GroupSpec, units: Mapping[str, GuardedArm], others: Iterable[GroupMemory]) -> list[str]:
     """Give the servos of a group's arms their guards.
 
-    Args:
-        group: The group.
-        units: Its arms.
-        others: Memories of other groups, with the states of their arms.
-
     Returns:
         Notes for the user: what is not checked, and which arms overlap at the start.
     """

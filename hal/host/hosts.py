@@ -165,14 +165,7 @@ class LocalHost(Host):
         latch: StopLatch | None = None,
         shared: SharedMemory | None = None,
     ) -> None:
-        """Open the devices.
-
-        Args:
-            spec: The group.
-            others: Groups in processes of their own that keep in step with this one.
-            latch: The rig's latched stop.
-            shared: Memory that those may read; None if there are none.
-        """
+        """Open the devices."""
         from .cycle import Cycle  # with the servo's libraries, so only in the process that runs it
 
         super().__init__(latch)
@@ -267,16 +260,7 @@ class RemoteHost(Host):
         others: Sequence[tuple[GroupSpec, SharedMemory]] = (),
         latch: StopLatch | None = None,
     ) -> None:
-        """Start the process.
-
-        Args:
-            spec: The group.
-            realtime: Whether it requests real-time priority.
-            shared: Its memory, from :meth:`allocate`; None for a new one.
-            others: Groups whose arms have copies in this one's world, must not be touched, or have this one's gripper,
-                with their memories.
-            latch: The rig's latched stop.
-        """
+        """Start the process. Arms of ``others`` have copies in this one's world, are kept off, or have its gripper."""
         super().__init__(latch)
         self.spec = spec
         self._pid = os.getpid()

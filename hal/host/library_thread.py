@@ -23,11 +23,7 @@ Job = Callable[[], object]
 
 
 class LibraryThread:
-    """The base of a driver's link. The cycle and the thread share it.
-
-    Args:
-        name: The arm's name.
-    """
+    """The base of a driver's link. The cycle and the thread share it."""
 
     LIBRARY: ClassVar[str]
     """Name of the library, for messages."""
@@ -60,12 +56,7 @@ class LibraryThread:
         self._lock = lock
 
     def begin(self, turn: Callable[[threading.Event], None], leave: Job) -> None:
-        """Start the thread.
-
-        Args:
-            turn: What it does again and again. Gets an event that is set once it has to end.
-            leave: What it does at its end.
-        """
+        """Start the thread: ``turn`` again and again, with an event that is set once it has to end, then ``leave``."""
         self.refused, self._jobs = None, []
         ended = self._ended = threading.Event()
 

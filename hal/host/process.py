@@ -490,13 +490,7 @@ def _serve_message(
 
 
 def child_main(target: str, fds: Sequence[int], library: Sequence[Any]) -> None:
-    """Run a child: call the target, report an error that it raises, end without interpreter tear-down.
-
-    Args:
-        target: ``module:function``.
-        fds: Descriptors of the socket and of the memories.
-        library: The app's copy of this library; another one is refused.
-    """
+    """Run a child: call the target, report an error that it raises, end without interpreter tear-down."""
     channel = Channel(socket.socket(fileno=fds[0]))
     status = 0
     try:

@@ -62,12 +62,9 @@ class PairDistance:
 class CollisionModel:
     """Distances of an arm's links from each other, from the boxes of a rig, and from the links of other arms.
 
-    Joint positions are those of all arms in their order, (n,) with n the sum of their numbers of joints. An object has
-    scratch memory, so every thread needs its own.
-
-    Args:
-        robots: The arm, and the others that it must not touch. Pairs of others among themselves are not checked.
-        spec: What is checked.
+    The arm is the first of ``robots``; pairs of the others among themselves are not checked. Joint positions are those
+    of all arms in their order, (n,) with n the sum of their numbers of joints. An object has scratch memory, so every
+    thread needs its own.
 
     Raises:
         NotSupported: An arm has no collision shapes, or a mesh that cannot be read.

@@ -73,10 +73,6 @@ class _Uploaded(NamedTuple):
 class UploadedEpisodes:
     """The episodes at an address, as the program sees them.
 
-    Args:
-        address: The address.
-        recipe: Fields of the recipe of the run, kept there for those that continue it.
-
     Raises:
         DriverMissing: fsspec, or its package for this kind of address, is not installed.
         CommandError: The address is wrong (code ``bad_address``).
@@ -137,9 +133,6 @@ class EpisodeUploader:
 
     What workers that were killed left in the temporary folder of this computer is removed.
 
-    Args:
-        address: Where the episodes go.
-
     Raises:
         DriverMissing: fsspec, or its package for this kind of address, is not installed.
         CommandError: The address is wrong (code ``bad_address``).
@@ -171,10 +164,6 @@ class EpisodeUploader:
 
     def upload(self, number: int, mark: bool | None) -> None:
         """Upload an episode, which is the last of the dataset.
-
-        Args:
-            number: Its number in the run.
-            mark: Whether it is marked a success.
 
         Raises:
             ConnectionLost: It cannot be uploaded (code ``upload_failed``).

@@ -41,11 +41,7 @@ class KeyboardTable(NamedTuple):
 
 @cache
 def keyboard_table(column: str) -> KeyboardTable:
-    """Return the keys that ``column`` of the table names.
-
-    Args:
-        column: ``terminal`` (the names of :mod:`hal.drivers.terminal`) or ``browser`` (``KeyboardEvent.code``).
-    """
+    """Return the keys that ``column`` of the table names."""
     import yaml
 
     data: dict[str, Any] = yaml.safe_load(find_data("sensors", "keyboard.yaml").read_text(encoding="utf-8"))

@@ -223,12 +223,6 @@ def guess_model(pad: Identity, axes: Collection[int], keys: Collection[int], rel
     If there are RX and RY, they are the right stick and Z and RZ the triggers; otherwise Z and RZ are the right stick,
     and BRAKE and GAS the triggers (Xbox pads over Bluetooth, 8BitDo). Six axes without a gamepad's buttons are a
     SpaceMouse.
-
-    Args:
-        pad: The pad.
-        axes: Its ``ABS_`` codes.
-        keys: Its ``BTN_`` and ``KEY_`` codes.
-        rels: Its ``REL_`` codes.
     """
     bus = pad.bus_name if pad.bus_name != "other" else None
     # A device on USB may be a receiver; the user corrects this if the pad has a cable.

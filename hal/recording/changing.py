@@ -107,10 +107,7 @@ def _change_marks(
 ) -> None:
     """Change marks in a dataset that is locked (:func:`open_to_change`); all of them or, on an error, none.
 
-    Args:
-        layout: The dataset.
-        marks: The new marks by number of the episode.
-        rows: New values (rows, 1) of the column of successes, where they change.
+    ``rows`` has new values (rows, 1) of the column of successes.
     """
     folder, moves = layout.change, list[tuple[str, str]]()
 

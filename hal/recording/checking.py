@@ -41,9 +41,7 @@ _CLOSE_STATS = 1e-6
 def check_dataset(dataset: Dataset, episodes: Collection[int] | None = None) -> Iterator[DatasetError]:
     """Yield every error in a dataset, or in some of its episodes. Reads every row and decodes every picture.
 
-    Args:
-        dataset: The dataset.
-        episodes: Numbers of the episodes; None for all, and for the index too.
+    ``episodes`` None checks all, and the index too.
     """
     layout = DatasetLayout(dataset.root)
     if episodes is None:
@@ -288,13 +286,6 @@ def check_compatible(
     layout: DatasetLayout, features: Mapping[str, Any], fps: int, robot_type: str, cameras: Sequence[CameraSetup]
 ) -> None:
     """Check whether episodes of this format can be added to a dataset.
-
-    Args:
-        layout: The dataset; its folder may not exist yet.
-        features: Columns of the new episodes.
-        fps: Their rows per second.
-        robot_type: Their arms.
-        cameras: Their cameras.
 
     Raises:
         CommandError: The dataset has another format (code ``other_dataset``; the message lists all differences), or

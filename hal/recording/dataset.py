@@ -51,11 +51,7 @@ class _Columns(dict[str, NDArray[Any]]):
 
 
 class _ReadMemory:
-    """Forgets what was read first of the episodes, when that of all needs too much memory.
-
-    Args:
-        limit: Size of all, bytes.
-    """
+    """Forgets what was read first of the episodes, when that of all needs more than ``limit`` bytes."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit

@@ -99,15 +99,7 @@ def rows_table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Any])
 def entry_row(
     about: Mapping[str, Any], place: EpisodePlace, start: int, fps: int, stats: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Return an episode's row of ``meta/episodes``.
-
-    Args:
-        about: Metadata of the episode: its number, rows, task, mark, dropped rows and cameras are used.
-        place: Its files.
-        start: Number of its first row in the whole dataset.
-        fps: Rows per second.
-        stats: Statistics of each column and video.
-    """
+    """Return an episode's row of ``meta/episodes``; its first one in the whole dataset is row ``start``."""
     number, length = about["episode"], about["length"]
     row = {"episode_index": number, "tasks": [about["task"]], "length": length, **_at("data", place.data[0])}
     row |= {"dataset_from_index": start, "dataset_to_index": start + length}
@@ -194,11 +186,6 @@ def write_mark(partial: Path, success: bool) -> None:
 
 def finalise(layout: DatasetLayout, partial: Path, *, recovered: bool = False) -> int | None:
     """Make an episode of a partial folder.
-
-    Args:
-        layout: The dataset, which must be locked.
-        partial: The folder; its content is not trusted.
-        recovered: Whether the program that recorded it was interrupted.
 
     Returns:
         The episode's number; None if the folder held no row, and was removed.

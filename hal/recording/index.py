@@ -154,12 +154,7 @@ def make_column(values: NDArray[Any]) -> Any:
 
 
 def read_stats(table: Any, keys: Collection[str] | None = None) -> dict[str, dict[str, NDArray[Any]]]:
-    """Return the statistics in a file of ``meta/episodes``, by column or video and by name, each (episodes, ...).
-
-    Args:
-        table: The file's content as an Arrow table.
-        keys: Columns and videos; None for all.
-    """
+    """Return the statistics in a file of ``meta/episodes``, by column or video and by name, each (episodes, ...)."""
     found: dict[str, dict[str, NDArray[Any]]] = {}
     for name in table.column_names:
         if name.startswith("stats/") and (keys is None or name.split("/")[1] in keys):

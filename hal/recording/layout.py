@@ -120,14 +120,7 @@ def video_key(video: str) -> str:
 def features_of(
     columns: Sequence[Column], cameras: Sequence[CameraSetup], fps: int, video: dict[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Return ``features`` of ``meta/info.json``.
-
-    Args:
-        columns: Columns of a row.
-        cameras: The recorded cameras.
-        fps: Rows per second.
-        video: The encoder's own entries of a video's ``info``.
-    """
+    """Return ``features`` of ``meta/info.json``."""
     found = {column.key: column.feature for column in columns}
     features = {STATE: found.pop(STATE), ACTION: {**found[SETPOINT]}, **found}
     features |= {key: {"dtype": dtype, "shape": [1], "names": None} for key, dtype in AFTERWARDS.items()}
@@ -407,10 +400,6 @@ def building_folder(target: DatasetLayout, what: str) -> Iterator[DatasetLayout]
     """Hold an empty hidden folder beside a place, to build there what comes into it. It is removed in the end.
 
     What a killed program left in it is removed first.
-
-    Args:
-        target: The place.
-        what: What is done, for the folder's name.
 
     Raises:
         CommandError: Another process holds this folder (code ``dataset_locked``).

@@ -36,10 +36,6 @@ class ClockPace:
     """Measures the pace of each arm's own clock, relative to the rig's, over the rows of one episode.
 
     A simulation that cannot keep up with real time is slower than 1.
-
-    Args:
-        columns: Columns of a row: (key, type, names).
-        simulated: Names of the arms in a simulated world.
     """
 
     def __init__(self, columns: Iterable[Sequence[Any]], simulated: Collection[str] = ()) -> None:

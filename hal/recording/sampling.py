@@ -117,10 +117,7 @@ class CameraBuffer:
             self._lost = self.camera.clock.now(), lost
 
     def frame(self, t: float) -> Frame:
-        """Return the picture of the row that was due at ``t``.
-
-        Args:
-            t: Due time of the row, s on the rig's clock.
+        """Return the picture of the row that was due at ``t``, s on the rig's clock.
 
         Raises:
             ConnectionLost: The camera was lost before ``t``.
@@ -139,10 +136,6 @@ class CameraBuffer:
 
     def copy_into(self, frame: Frame, images: Images) -> None:
         """Copy the pictures of ``frame`` into a slot of the queue, unless they are those of the row before.
-
-        Args:
-            frame: The row's frame.
-            images: The slot's array of each stream.
 
         Raises:
             ValueError: A picture has another size than the camera's configuration.
@@ -202,12 +195,6 @@ class RowSampler:
 
     With several arms, a column holds the joints of one after the other, and their names begin with the arm's. A dataset
     that is continued gets no forces and no controls of pads that its first episodes do not have, and the same objects.
-
-    Args:
-        rig: An open rig.
-        cameras: Cameras that are recorded.
-        known: Names of the numbers of each column of the dataset; None for a new one.
-        objects: Whether the poses of the objects are an observation, too.
     """
 
     def __init__(
@@ -319,12 +306,7 @@ class RowSampler:
         return RowSnapshot(pads, seen.poses, seen.t, driver)
 
     def row(self, t: float, snapshot: RowSnapshot, frames: dict[str, Frame]) -> list[float]:
-        """Return the numbers of a row.
-
-        Args:
-            t: Due time of the row, s on the rig's clock, like all times in it.
-            snapshot: What was read at that time.
-            frames: The row's picture of each camera.
+        """Return the numbers of the row that was due at ``t``, s on the rig's clock.
 
         Returns:
             :attr:`width` numbers, in the order of :attr:`columns`.
@@ -386,13 +368,9 @@ def select_devices(
     streams: Collection[str],
     known: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[RowSampler, list[CameraBuffer], list[str]]:
-    """Return what is recorded of a rig.
+    """Return what is recorded of a rig. Without ``cameras`` all are; ``streams`` may have ``objects``, for their poses.
 
-    Args:
-        rig: An open rig.
-        cameras: Names of the cameras; None for all.
-        streams: Streams to record of the cameras that have them; ``objects`` for poses of objects as an observation.
-        known: Names of the numbers of each column of the dataset that is continued; None for a new one.
+    ``known`` are the names of the numbers in each column of the dataset that is continued.
 
     Returns:
         The sampler of all arms and pads, a buffer per camera, and notes for the operator.

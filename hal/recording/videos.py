@@ -60,10 +60,7 @@ _ENCODERS = (
 
 
 def choose_encoder(codec: str) -> VideoEncoder:
-    """Return the encoder of a codec.
-
-    Args:
-        codec: ``h264``, ``av1``, or ``auto`` for the first that is available.
+    """Return the encoder of ``h264``, ``av1`` or ``auto``, the first that is available.
 
     Raises:
         CommandError: Another codec.

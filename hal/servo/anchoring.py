@@ -174,10 +174,6 @@ class Anchoring:
     def check_report(self, reading: Reading, device: Trip) -> bool:
         """Compare a reading with what was given.
 
-        Args:
-            reading: The newest reading.
-            device: The trip that the device causes.
-
         Returns:
             Whether the smoother was corrected.
         """

@@ -104,13 +104,7 @@ class _JointStop(Stop):
 
 
 class CollisionGuard:
-    """Checks the steps of one arm, and slows down its goals.
-
-    Args:
-        model: Shapes of this arm, and of the others that it must not touch.
-        smoother: Its set-point.
-        others: The other arms of the model, in its order.
-    """
+    """Checks the steps of one arm, and slows down its goals."""
 
     def __init__(self, model: CollisionModel, smoother: JointSmoother, others: Sequence[Neighbour] = ()) -> None:
         self._margins: list[float] = model.margins.tolist()
@@ -194,8 +188,7 @@ class CollisionGuard:
     def allows(self, stop: Stop | None = None) -> bool:
         """Return whether the proposed step, and the stop after it, keep every margin, or come no nearer than now.
 
-        Args:
-            stop: The stop, if it is made along a path; None if each joint stops by itself.
+        Without a ``stop`` along a path each joint stops by itself.
         """
         if stop is None and self._is_far_next():
             return True
@@ -322,10 +315,7 @@ class CollisionGuard:
 class _Surroundings:
     """The distances of one arm from everything around it, computed only where it may be too near.
 
-    Args:
-        model: Shapes of this arm, and of the others that it must not touch.
-        others: The other arms of the model, in its order.
-        least: Distances (pairs,), m, below which a pair is near.
+    A pair is near below ``least`` (pairs,), m.
     """
 
     def __init__(self, model: CollisionModel, others: Sequence[Neighbour], least: Array) -> None:
@@ -446,10 +436,6 @@ class MeasuredGuard:
 
     Its stop is predicted. A pair that is inside its margin when the torques begin, or at it, may come no nearer than
     :data:`_NOISE`, and no nearer by each begin until it has parted.
-
-    Args:
-        model: As for :class:`CollisionGuard`.
-        others: Likewise.
     """
 
     def __init__(self, model: CollisionModel, others: Sequence[Neighbour]) -> None:

@@ -54,11 +54,7 @@ def followable_jerk(mass: NDArray[np.float64]) -> list[float]:
 class Compliance:
     """Drives one arm by a controller; ``active`` from the first command until positions hold the arm again.
 
-    Args:
-        torque: The arm's torques: its bounds, its measured state, its brake.
-        envelope: The envelope of the set-point.
-        spec: The arm.
-        simulated: Whether it has the joint damping of its URDF, which the controller of a real arm compensates.
+    A ``simulated`` arm has the joint damping of its URDF, which the controller of a real one compensates.
     """
 
     def __init__(self, torque: TorqueMotion, envelope: Envelope, spec: RobotSpec, simulated: bool) -> None:

@@ -169,13 +169,6 @@ def resolve(
 ) -> Controller:
     """Return a controller with a value for every gain, checked against an arm that takes torques.
 
-    Args:
-        controller: The controller, as the program passed it.
-        spec: The arm.
-        kinematics: Its kinematics.
-        rate_hz: Rate of the servo, Hz.
-        simulated: Whether it has the joint damping of its URDF.
-
     Raises:
         CommandError: A wrong number of gains, a posture beyond the limits, or gains that are too stiff for the arm's
             inertia at this rate (``code`` is ``bad_controller``).

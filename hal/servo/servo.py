@@ -232,13 +232,7 @@ class Servo:
             self._forget_goals()
 
     def tick(self, now: float, reading: Reading, inbox: Inbox, late: bool = False) -> Setpoint | None:
-        """Compute the next set-point.
-
-        Args:
-            now: Time, s.
-            reading: The newest reading of the device.
-            inbox: The newest records of the app.
-            late: Whether this process was paused in a way that ``now`` does not show (a suspended computer).
+        """Compute the next set-point, at ``now``, s; ``late`` after a pause that it does not show (suspended computer).
 
         Returns:
             The set-point; None while no session is open. A device that was answered gets it with the next
@@ -289,10 +283,6 @@ class Servo:
         It is the one that the last tick computed. If there is none, or the device lost the one before, it is one step
         of a stop, from where the device is; the next tick continues from there. So the answer never waits for a long
         computation, a single loss costs a step, and an arm whose set-points are late again and again slows down.
-
-        Args:
-            now: Time, s.
-            reading: The newest reading of the device, also passed to the next :meth:`tick`.
 
         Returns:
             The set-point; None while no session is open, for another device, and for torques, which need the newest

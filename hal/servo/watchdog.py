@@ -91,14 +91,9 @@ class Watchdog:
         self._command = command
 
     def update(self, now: float, inbox: Inbox, at_rest: bool, device: Trip = Trip.NONE, late: bool = False) -> bool:
-        """Decide for one tick.
+        """Decide for one tick at ``now``, s; motion only starts from a set-point at rest.
 
-        Args:
-            now: Time, s.
-            inbox: The newest records of the app.
-            at_rest: Whether the set-point is at rest; motion only starts from rest.
-            device: The trip that the device causes.
-            late: Whether the last tick was too long ago.
+        ``device`` is the trip that the device causes; ``late`` says that the last tick was too long ago.
 
         Returns:
             :attr:`allowed`.

@@ -39,12 +39,7 @@ def parse_episodes(text: str) -> list[int]:
 def select_episodes(
     dataset: Dataset, wanted: str | Collection[int] | None, *, successful_only: bool
 ) -> tuple[Episode, ...]:
-    """Return the selected episodes, each once, in the dataset's order.
-
-    Args:
-        dataset: The dataset.
-        wanted: Numbers, or a text such as ``0,3-5``; None for all.
-        successful_only: Leave out episodes that are not marked a success.
+    """Return the selected episodes (numbers, or a text such as ``0,3-5``), each once, in the dataset's order.
 
     Raises:
         CommandError: There is no such episode, or none is left (code ``no_episodes``).
@@ -94,13 +89,7 @@ class PictureStream:
 
 
 class EpisodeContent:
-    """One episode, with the selected cameras.
-
-    Args:
-        episode: The episode.
-        cameras: Names of the cameras; None for all.
-        depth: False leaves depth out.
-        size: Width and height to which pictures are cropped and scaled; None leaves them as they are.
+    """One episode, with the selected cameras; pictures are cropped and scaled to ``size``, width and height.
 
     Raises:
         CommandError: The episode lacks a camera (code ``no_such_camera``).
@@ -306,11 +295,6 @@ def camera_roles(
 
     By default the first camera on an arm is ``gripper_camera``, the first that is not on an arm is ``camera``, and all
     others keep their names.
-
-    Args:
-        content: The episode.
-        camera: Name of the camera that becomes ``camera``; None for the default.
-        gripper_camera: Name of the camera that becomes ``gripper_camera``; None for the default.
 
     Raises:
         CommandError: There is no such camera (code ``no_such_camera``), or two would have the same name

@@ -121,10 +121,7 @@ def _streams(content: EpisodeContent) -> dict[str, tuple[int, ...]]:
 def write_atomically(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
     """Yield a temporary path beside ``path``. It is renamed at the end, and removed after an error.
 
-    Args:
-        path: File or folder to write.
-        force: Replace an export that exists.
-        is_ours: Returns whether a path is such an export.
+    ``force`` replaces what ``is_ours`` says is an export.
 
     Raises:
         CommandError: Something exists at ``path`` (code ``exists``), or it is not an export (``not_an_export``).
