@@ -256,7 +256,6 @@ class DamiaoArm(RobotDriver):
         return self._holds
 
     def _stop_torque(self) -> None:
-        """Leave torque mode: hold the measured position."""
         self._tau_sent = None
         self._target = [motor.q for motor in self._motors]
         self._holds = None
@@ -336,7 +335,6 @@ class DamiaoArm(RobotDriver):
         self._switch_on(motor)
 
     def _switch_on(self, motor: ChainMotor) -> None:
-        """Switch a motor on where it is."""
         motor.on = False  # so that it holds where it is measured
         hold = self._hold_commands()[self._motors.index(motor)]
         self._switching, self._t_switched = motor, self._now

@@ -271,7 +271,6 @@ class DamiaoGripper(GripperDriver):
         return max(0.0, -table.opening * motor.tau - motor.settings.friction) / table.slope(motor.q)
 
     def _switch_on(self) -> None:
-        """Switch the motor on where it is."""
         motor = self._motor
         fault = self.chain.register_fault()
         if fault is not None:

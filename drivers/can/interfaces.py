@@ -18,8 +18,6 @@ _PATIENCE = 3.0
 
 
 class CanInterface(NamedTuple):
-    """One interface."""
-
     name: str
     up: bool
     virtual: bool = False

@@ -85,7 +85,6 @@ class PiperArm(RobotDriver):
         self._forget()
 
     def _forget(self) -> None:
-        """Forget everything that the arm has reported, and that it was asked for."""
         self.engaged = False
         self._now = -inf
         self._reads = 0

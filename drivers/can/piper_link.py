@@ -93,7 +93,6 @@ def control_fault(status: PiperStatus, flags: Iterable[int]) -> Fault | None:
 
 
 def refusal(name: str, fault: Fault) -> RobotFault:
-    """Return the exception of an arm that refuses because of a fault."""
     return RobotFault(f"{name}: {fault.cause}", fault.remedy, code=fault.code)
 
 
@@ -170,7 +169,6 @@ class PiperLink:
             time.sleep(0.002)
 
     def close(self) -> None:
-        """Give up the bus. Idempotent."""
         bus, self.bus = self.bus, None
         if bus is not None:
             bus.unsubscribe(self._ids, self._sent)

@@ -140,8 +140,6 @@ def bus_load(frames: float, settings: BusSettings) -> float:
 
 
 class _Traffic(NamedTuple):
-    """Frames on a bus during a measurement."""
-
     seconds: float
     frames: int
     errors: int
@@ -270,7 +268,6 @@ def _check_states(chains: Sequence[DamiaoChain]) -> Iterator[CheckResult]:
 
 
 def _check_firmware(chains: Sequence[DamiaoChain]) -> CheckResult:
-    """Read the motors' firmware versions."""
     motors = [motor for chain in chains for motor in chain.motors]
     for chain in chains:
         for motor in chain.motors:

@@ -272,11 +272,9 @@ class DeviceFinder:
         return self._system.nodes()
 
     def forget(self) -> None:
-        """Make the next scan return the devices in any case."""
         self._seen = None
 
     def due(self) -> bool:
-        """Whether it is time for a scan."""
         return time.monotonic() >= self._next
 
     def open(self, info: NodeInfo) -> EvdevNode:

@@ -70,12 +70,10 @@ class PadLink:
 
     @property
     def lacks_motion(self) -> bool:
-        """Whether the motion sensor is still to be found."""
         return self.model.motion_node is not None and self._motion is None
 
     @property
     def lacks_touch(self) -> bool:
-        """Whether the touchpad is still to be found."""
         return self.model.touch_node is not None and self._touch is None
 
     def add_motion(self, motion: EvdevNode) -> None:

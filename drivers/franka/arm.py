@@ -190,7 +190,6 @@ class FrankaArm(RobotDriver):
         return self._dynamics.mass_matrix(q)
 
     def halt(self) -> None:
-        """End the motion: the robot holds its position."""
         link = self._connection.link
         if link is None or link.motion is None:
             return
@@ -468,7 +467,6 @@ class ArmConnection:
         return fault_of_exception(error, host=self.settings.host)
 
     def error(self, fault: Fault | None = None) -> ConnectionLost:
-        """Return the exception to raise while there is no connection."""
         return ConnectionLost.of(self.name, fault or self.lost or Fault("closed", "it is not open", "open the rig"))
 
     def close(self) -> None:

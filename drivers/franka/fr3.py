@@ -17,8 +17,6 @@ _NOISE = 4e-6
 
 
 class Fr3Link(ArmLink):
-    """An FR3 (protocol 10)."""
-
     protocol = 10
     library_errors = (RuntimeError, pylibfranka.FrankaException)
 

@@ -84,8 +84,6 @@ CallAnswer: TypeAlias = "bool | Fault"
 
 
 class EndedCall(NamedTuple):
-    """A motion that has ended."""
-
     call: GripperCall
     answer: CallAnswer
     stopped: bool
@@ -151,8 +149,6 @@ def _lost_fault(reason: str) -> Fault:
 
 
 class CommandResult(NamedTuple):
-    """Result of a command."""
-
     outcome: GripperOutcome
     fault: Fault | None = None
 
@@ -299,16 +295,12 @@ def _answer_to(call: GripperCall, ended: EndedCall | None) -> CallAnswer | None:
 
 
 class HandAction(Enum):
-    """Action on the connection."""
-
     STOP = "stop"
     RECONNECT = "reconnect"
 
 
 @dataclass
 class _RunningCall:
-    """The running motion."""
-
     call: GripperCall
     deadline: float
     stopped_at: float | None = None

@@ -97,7 +97,6 @@ class HandLink:
 
     @property
     def up(self) -> bool:
-        """Whether calls can be sent."""
         return self._child is not None and not self._connecting
 
     def poll(self) -> Iterator[LinkEvent]:
@@ -153,7 +152,6 @@ class HandLink:
                 self._child.channel.send({"id": self._pending, "method": method, "params": arguments}, timeout=0.1)
 
     def restart(self, reason: str) -> None:
-        """End this connection; :meth:`poll` starts the next one."""
         self.reason = reason
         self._end()
         self._t_next = time.monotonic() + _RESTART_PAUSE

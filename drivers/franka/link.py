@@ -103,12 +103,10 @@ class ArmLink(ABC):
         self.motion = self.still = None
 
     def disconnect(self) -> None:
-        """Release the robot; a running motion is cancelled. Idempotent."""
         self.abandon()
         self.robot = self.state = None
 
     def recover(self) -> None:
-        """Run the automatic error recovery."""
         self.robot.automatic_error_recovery()
 
     def configure(self, settings: ArmSettings) -> None:

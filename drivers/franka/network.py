@@ -33,8 +33,6 @@ def lock_arm(host: str) -> DeviceLock:
 
 
 class PortState(Enum):
-    """Result of a connection attempt to a port."""
-
     OPEN = "open"
     REFUSED = "refused"
     """The computer answers, but no program listens."""
@@ -136,15 +134,12 @@ class NotMeasured(Exception):
 
 @dataclass(frozen=True)
 class RoundTrips:
-    """Result of a measurement."""
-
     sent: int
     times: Sequence[float]
     """Round-trip times of the packets that came back, in ascending order, s."""
 
     @property
     def lost(self) -> int:
-        """Number of packets that did not come back."""
         return self.sent - len(self.times)
 
     def quantile(self, share: float) -> float:

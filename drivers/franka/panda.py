@@ -14,8 +14,6 @@ _NO_FILTER = 1000.0
 
 
 class PandaLink(ArmLink):
-    """A Panda (protocol 5)."""
-
     protocol = 5
     owns_loop = True
 

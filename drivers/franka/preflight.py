@@ -115,7 +115,6 @@ def _check_route(host: str, address: str) -> CheckResult:
 
 
 def _check_robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[CheckResult]:
-    """Check what the robot reports about itself."""
     host = settings.host
     report = _query_robot(host, settings.arm)
     if report is None:
@@ -157,7 +156,6 @@ def _check_noise(noise: float) -> CheckResult:
 
 
 def _check_hand(spec: RobotSpec) -> Iterator[CheckResult]:
-    """Check the hand, if the rig has one, and its driver's library."""
     gripper = spec.gripper
     if gripper is None or gripper.driver != spec.driver:
         return

@@ -127,7 +127,6 @@ class MockCamera(MockDevice[MockCameraFaults], CameraDriver):
         )
 
     def _draw(self, seq: int, t: float) -> dict[str, NDArray[Any]]:
-        """Return the image of every stream."""
         spec, width, height = self.spec, self.spec.width, self.spec.height
         plane = min(PLANE, spec.depth_max)
         near = max(plane - 0.1, spec.depth_min)

@@ -93,7 +93,6 @@ class MockRobot(MockDevice[MockRobotFaults], RobotDriver):
         return due is not None
 
     def _driven(self, tau: Sequence[float], dt: float) -> Setpoint:
-        """Return position and velocity after torques acted for ``dt`` seconds."""
         dq = [(INERTIA * v + dt * x) / (INERTIA + dt * FRICTION) for v, x in zip(self._follows.dq, tau, strict=True)]
         q = [x + dt * v for x, v in zip(self._follows.q, dq, strict=True)]
         return Setpoint(q, dq, (0.0,) * len(q), tau)
@@ -263,7 +262,6 @@ class MockGripper(MockDevice[MockGripperFaults], GripperDriver):
         self._start(0.0, speed, force)
 
     def home(self) -> None:
-        """Open completely."""
         self._expect_open()
         self.homed += 1
         self._start(self.spec.width_max, self.spec.speed, self.spec.force)

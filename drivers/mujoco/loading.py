@@ -88,8 +88,6 @@ class Shape:
 
 @dataclass
 class Inertial:
-    """Mass of a link."""
-
     mass: float
     """kg"""
     moments: Array
@@ -331,7 +329,6 @@ def _shapes(link: UrdfLink, scale: float, sliced: bool) -> Iterator[Shape]:
 
 
 def _uniform(mass: float, shape: Shape) -> Inertial:
-    """Return the mass and the inertia of a primitive of uniform density."""
     if shape.kind == "box":
         return Inertial(mass, mass * _box_inertia(shape.corners()), shape.pose)
     r, half = shape.size[0], shape.size[-1] if len(shape.size) == 2 else 0.0
@@ -342,7 +339,6 @@ def _uniform(mass: float, shape: Shape) -> Inertial:
 
 
 def _solid(mass: float, hulls: Sequence[Hull]) -> Inertial:
-    """Return the mass of hulls of uniform density."""
     solid = uniform_solid(hulls)
     return Inertial(mass, mass * solid.moments, Pose.from_matrix(_frame(solid.axes, solid.centre)))
 
@@ -454,7 +450,6 @@ def build(model: Any, plan: BodyPlan) -> None:
 
 
 def take_out(model: Any, plan: BodyPlan) -> None:
-    """Remove a body that :func:`build` added."""
     body = plan.body
     root = model.body(body.mujoco_name(plan.links[0].name))
     prefix = body.mujoco_name()

@@ -91,7 +91,6 @@ class Motors:
         self._entries = np.append(np.arange(len(rows)), np.arange(len(rows)))
 
     def limit(self) -> None:
-        """Use new :attr:`efforts` and :attr:`speeds`."""
         self._most[0], self._most[1] = self.speeds, self.efforts * self._ease
         np.negative(self._most, out=self._least)
         with np.errstate(divide="ignore"):
@@ -142,7 +141,6 @@ class Motors:
             self._cut()
 
     def _cut(self) -> None:
-        """Cut the torques to the motors' limits."""
         applied, force = self.applied, self._driven_force
         np.copyto(force, applied)
         np.maximum(force, -self.efforts, out=applied)

@@ -496,7 +496,6 @@ class MujocoWorld(SimulatedWorld[Body]):
 
 
 def _find(body: Body, model: Any) -> None:
-    """Read the numbers that a body has in a model."""
     body.ids = [model.body(body.mujoco_name(link)).id for link in body.links]
     body.shapes = [np.flatnonzero(model.geom_bodyid == number).tolist() for number in body.ids]
     names = {number: name for name, number in body.joints.items()}

@@ -140,7 +140,6 @@ class Gear:
         self.engage()
 
     def engage(self) -> None:
-        """Couple the joints. Idempotent."""
         if self._number is None:
             self._number = self._client.createConstraint(*self._make)
             self._client.changeConstraint(self._number, **self._set)

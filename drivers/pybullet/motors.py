@@ -141,7 +141,6 @@ class SimulatedDynamics:
         return torques
 
     def inertia(self, q: Array) -> Array:
-        """Return the joint-space inertia (n, n), kg m2 or kg."""
         mass: Array = self._pin.crba(self._model, self._data, q)
         return mass
 
@@ -207,7 +206,6 @@ class JointTorques:
         self._handover = self._model.inertia(q)[self._block] @ (np.array(dq) - now[self._places]) / self._dt
 
     def switch_off(self) -> None:
-        """Switch the joints' own motors off."""
         client, nothing = self._client, [0.0] * len(self._joints)
         client.setJointMotorControlArray(self._body.id, self._joints, client.VELOCITY_CONTROL, forces=nothing)
         if not self._driving:

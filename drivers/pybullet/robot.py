@@ -112,5 +112,4 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
             self.follow_setpoint(q, dq)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
-        """Return the joint-space inertia of the simulated arm (n, n) at ``q``, kg m2."""
         return self._torques.mass_matrix(q)

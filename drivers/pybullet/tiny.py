@@ -102,7 +102,6 @@ class TinyRenderer(Renderer):
             self._client.removeBody(number)
 
     def _pose(self) -> None:
-        """Move every shape to its link."""
         places = [(body, visual.link) for body, (visuals, _) in self._shapes.items() for visual in visuals]
         numbers = [number for _, own in self._shapes.values() for number in own]
         for number, frame in zip(numbers, self._scene.link_frames(places), strict=True):

@@ -62,7 +62,6 @@ class RealSenseCamera(CameraDriver):
     """
 
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
-        """Check the options; raises ConfigError."""
         super().__init__(spec, source)
         self._settings = RealSenseSettings.of(spec)
         played = self._settings.play is not None
@@ -355,13 +354,11 @@ class CameraLink:
             self.lost = lost
 
     def close(self, timeout: float = _PATIENCE) -> None:
-        """End the process; kill it if it does not end within ``timeout`` s. Idempotent."""
         self._child.close(timeout)
         self._memory.close()
 
 
 def _copy(error: ConnectionLost) -> ConnectionLost:
-    """Return a new error for another ``raise``, without the first one's traceback."""
     copied = ConnectionLost(str(error), code=error.code)
     copied.final = error.final
     return copied

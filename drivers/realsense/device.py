@@ -211,8 +211,6 @@ class RealSenseDevice:
 
 
 class ConnectedCamera(NamedTuple):
-    """A camera that is connected to this computer."""
-
     device: Any
     """``rs2::device``"""
     title: str
@@ -322,7 +320,6 @@ class RecordingFiles:
                 raise ControlTaken(text, code="recording_in_use") from None
 
     def close(self) -> None:
-        """Release all files. Idempotent."""
         for lock in self._locks.values():
             lock.release()
         self._locks.clear()

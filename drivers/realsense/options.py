@@ -129,7 +129,6 @@ class RealSenseSettings(DeviceSettings):
 
     @property
     def is_real(self) -> bool:
-        """Whether the frames come from a connected camera."""
         return self.play is None and self.emulated is None
 
 
@@ -185,7 +184,6 @@ class _Assignment(NamedTuple):
 
 
 def find_sensors(device: Any) -> dict[str, Any]:
-    """Return the sensors (:data:`Sensors`) of ``rs2::device``."""
     import pyrealsense2 as rs
 
     found: dict[str, Any] = {}
@@ -232,7 +230,6 @@ def read_options(sensors: Sensors) -> dict[str, float]:
 
 
 def has_auto_exposure(sensors: Sensors) -> bool:
-    """Return whether the exposure of any sensor is automatic."""
     for sensor in sensors.values():
         option = _find_option(sensor, "enable_auto_exposure")
         if option is not None and sensor.get_option(option):
@@ -252,7 +249,6 @@ def _find_option(sensor: Any, name: str) -> Any | None:
 
 
 def _resolve(sensors: Sensors, wanted: Mapping[str, Any]) -> Iterator[_Assignment]:
-    """Find the sensor of each option."""
     for key, value in wanted.items():
         if isinstance(value, Mapping):
             if key not in sensors:

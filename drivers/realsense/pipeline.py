@@ -100,8 +100,6 @@ class LivePipeline:
 
 
 class PlaybackPipeline:
-    """A recording that is played."""
-
     is_live = False
 
     def __init__(self, context: Any, file: str, profiles: Mapping[str, Any], *, repeat: bool, paced: bool) -> None:
@@ -302,7 +300,6 @@ def _read_depth_scale(device: Any) -> float | None:
 
 
 def convert_intrinsics(intrinsics: Any) -> LensModel:
-    """Convert ``rs2::intrinsics`` to OpenCV's model."""
     K = np.array(
         [[intrinsics.fx, 0.0, intrinsics.ppx], [0.0, intrinsics.fy, intrinsics.ppy], [0.0, 0.0, 1.0]], np.float64
     )

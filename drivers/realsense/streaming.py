@@ -62,7 +62,6 @@ class ClockUnwrapper:
         self._last: float | None = None
 
     def __call__(self, stamp: float) -> float:
-        """Return a stamp without the wrap, s."""
         if self._last is not None and self._last - stamp > _WRAP / 2.0:
             self._turns += 1
         self._last = stamp
@@ -130,8 +129,6 @@ _ORDER = ("depth", "color", "infrared", "infrared_right")
 
 
 class FrameStamp(NamedTuple):
-    """Number and stamp of one frame."""
-
     number: int
     """By the camera's own count."""
     stamp: float
@@ -140,8 +137,6 @@ class FrameStamp(NamedTuple):
 
 
 class FrameMatch(Enum):
-    """Whether a frame set is a capture."""
-
     NEW = "new"
     REPEATED = "repeated"
     """Its leading frame was handed out before."""
@@ -448,7 +443,6 @@ class FrameStreamer:
         return newest
 
     def _match(self, frames: Any) -> _Capture | None:
-        """Return the frame set if it is a capture; otherwise count it."""
         arrival, wall = time.monotonic(), time.time()
         single = self._converter.split(frames)
         if single is None:
@@ -466,7 +460,6 @@ class FrameStreamer:
         return None
 
     def _write(self, capture: _Capture) -> None:
-        """Write a capture to the ring, and notify the app."""
         first = capture.stamps[self._matcher.lead]
         t, t_device = self._times(first.stamp, first.domain, capture.arrival, capture.wall)
         seq = self._numbers(first.number)

@@ -60,7 +60,6 @@ class Status(NamedTuple):
 
 
 def crc16(data: bytes) -> bytes:
-    """Return the check of a Modbus RTU frame."""
     value = 0xFFFF
     for byte in data:
         value ^= byte
@@ -178,7 +177,6 @@ class Link:
                 sleep(0.002)
 
     def close(self) -> None:
-        """Disconnect."""
         line, self.line = self.line, None
         if line is not None:
             os.close(line)

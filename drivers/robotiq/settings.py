@@ -53,7 +53,6 @@ class RobotiqSettings(DeviceSettings):
 
     @property
     def place(self) -> str:
-        """Where the gripper is, for messages."""
         return self.port or f"{self.host}:63352"
 
 
@@ -68,5 +67,4 @@ def check_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
 
 
 def is_emulated(options: Mapping[str, Any]) -> bool:
-    """Return whether these options are those of an emulator."""
     return is_own_host(options) if options.get("port") is None else serial_line.is_emulated(options)

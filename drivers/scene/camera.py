@@ -43,8 +43,6 @@ _IDLE = 0.001
 
 
 class FrameSource(Protocol):
-    """Source of the frames of one camera."""
-
     def grab(self, timeout: float) -> RawFrame | None:
         """Return the next frame, as :meth:`hal.camera.CameraDriver.grab`."""
 
@@ -93,7 +91,6 @@ class SimulatedCamera(CameraDriver):
             raise lost from error
 
     def close(self) -> None:
-        """Disconnect; the rig owns the source."""
         self._open = False
 
 
@@ -147,8 +144,6 @@ class SharedSource:
 
 
 class SimulatedPictures(CameraRenderer):
-    """Draws the pictures of all simulated cameras of one world."""
-
     def __init__(self, host: Host, cameras: Sequence[CameraSpec], renderer: str) -> None:
         super().__init__(host, cameras, renderer)
         self._child: Child | None = None

@@ -32,8 +32,6 @@ _SIDES = ("infrared", "infrared_right")
 
 
 class PosedWorld(Protocol):
-    """A world, as far as the place of a camera in it is concerned."""
-
     @property
     def randomized(self) -> Randomized:
         """What the world was randomized with."""
@@ -43,8 +41,6 @@ class PosedWorld(Protocol):
 
 
 class _Shot(NamedTuple):
-    """What is drawn in one call: the streams of one view."""
-
     spec: CameraSpec
     T_color: Pose
     """Pose of the view in the frame of the colour sensor."""

@@ -287,7 +287,6 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._send(self.spec.speed)
 
     def close(self) -> None:
-        """Disconnect; the motors hold, or press, for as long as the world exists."""
         if self._open:
             self.scene.off_reset(self.body.name, self._was_reset)
             self.scene.before_steps(f"{self.body.name}.gripper", None)

@@ -18,7 +18,6 @@ TOLERANCE = 1e-6
 
 
 def movable_joints(body: SimulatedBody) -> dict[str, BodyJoint]:
-    """Return the joints of a body that move, by name, in the order of the URDF."""
     found: dict[str, BodyJoint] = {}
     scale = body.spec.scale if isinstance(body.spec, BodySpec) else 1.0
     for name, joint in body.urdf.joints.items() if body.urdf is not None else ():

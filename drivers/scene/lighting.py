@@ -139,7 +139,6 @@ class ShadowMap:
         return matrix
 
     def use(self, place: int) -> None:
-        """Make the map the texture of this number."""
         self._texture.use(place)
 
 

@@ -497,8 +497,6 @@ def _lens(width: int, height: int, K: tuple[tuple[float, ...], ...]) -> tuple[Ar
 
 
 class _Output(NamedTuple):
-    """Layer of one stream."""
-
     type: str
     components: int
     dtype: str

@@ -33,8 +33,6 @@ _PLANE_HALF = 50.0
 
 
 class SceneBody(Protocol):
-    """A body of a world, as the renderer sees it."""
-
     @property
     def id(self) -> int:
         """Its number, which no other body of this world gets."""
@@ -45,8 +43,6 @@ class SceneBody(Protocol):
 
 
 class Visual(NamedTuple):
-    """A visual shape of a link."""
-
     link: int
     """Number of the link in its body; 0 is the base."""
     kind: str
@@ -65,8 +61,6 @@ class Visual(NamedTuple):
 
 
 class RenderScene(Protocol):
-    """A world, as the renderer sees it."""
-
     @property
     def bodies(self) -> Mapping[str, SceneBody]: ...
     @property
@@ -166,7 +160,6 @@ class Mesh:
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Join meshes that share a texture."""
     offsets = np.cumsum([0] + [len(m.positions) for m in meshes[:-1]])
     return replace(
         meshes[0],

@@ -107,7 +107,6 @@ class Connection:
         return newest
 
     def close(self) -> None:
-        """Disconnect."""
         self.sock.close()
 
 

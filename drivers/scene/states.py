@@ -34,7 +34,6 @@ def check_state(state: Any, engine: str, ours: list[list[Any]]) -> None:
 
 
 def _difference(theirs: list[list[Any]], ours: list[list[Any]]) -> str:
-    """Return how the bodies of a state differ from those of this world, which they do."""
     there, here = ([body[0] for body in bodies] for bodies in (theirs, ours))
     lacking = [str(name) for name in there if name not in here]
     further = [str(name) for name in here if name not in there]

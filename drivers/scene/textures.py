@@ -35,7 +35,6 @@ def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _smooth_noise(cells: int, seed: int) -> NDArray[np.float64]:
-    """Return noise (H, W), 0..1, that changes over 1/``cells`` of the side."""
     values = np.random.default_rng(seed).random((cells, cells))
     at = np.arange(_SIDE) * cells / _SIDE
     low, share = at.astype(int), at % 1.0

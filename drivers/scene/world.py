@@ -179,11 +179,9 @@ class SimulatedWorld(SceneEngine[B]):
             raise
 
     def names(self) -> list[str]:
-        """Return the names of all bodies, objects first, in the order in which they were added."""
         return list(self.bodies)
 
     def describe(self, name: str) -> dict[str, Any]:
-        """Return what a body consists of: see :class:`hal.world.WorldDriver`."""
         body = self.body(name)
         links, joints = list(body.links), list(body.joints)
         movable = {joint: facts._asdict() for joint, facts in movable_joints(body).items()}
@@ -224,7 +222,6 @@ class SimulatedWorld(SceneEngine[B]):
         return dict(zip(movable_joints(body), self.read_joints(body), strict=True))
 
     def set_joint_positions(self, name: str, positions: Mapping[str, float]) -> None:
-        """Place joints of an object: see :meth:`hal.world.World.set_joint_positions`."""
         body = self.body(name)
         if body.is_robot:
             raise CommandError(f"{name!r} is a robot: its servo moves it; reset(q=...) places it", code="is_robot")
@@ -253,7 +250,6 @@ class SimulatedWorld(SceneEngine[B]):
         link: str | None = None,
         duration: float | None = None,
     ) -> None:
-        """Push a link with a constant force: see :meth:`hal.world.World.apply_force`."""
         body = self.body(name)
         number = self.link(body, link)
         self._expect_free(body)
@@ -286,7 +282,6 @@ class SimulatedWorld(SceneEngine[B]):
         return before
 
     def ray(self, start: Sequence[float], end: Sequence[float]) -> dict[str, Any] | None:
-        """Return what a ray meets first: see :meth:`hal.world.World.ray`."""
         here, there = numbers("start", start, 3), numbers("end", end, 3)
         if math.dist(here, there) < 1e-9:
             raise CommandError("a ray needs two different points, start and end")
@@ -303,7 +298,6 @@ class SimulatedWorld(SceneEngine[B]):
         }
 
     def distance(self, a: str, b: str, link_a: str | None = None, link_b: str | None = None) -> float:
-        """Return the smallest distance of two bodies: see :meth:`hal.world.World.distance`."""
         first, second = self.body(a), self.body(b)
         if first is second:
             raise CommandError(f"the distance needs two bodies, not {a!r} twice")
@@ -458,7 +452,6 @@ class SimulatedWorld(SceneEngine[B]):
         self.place_attached()
 
     def save(self) -> dict[str, Any]:
-        """Return the state of the world and of its drivers: see :meth:`hal.world.World.save`."""
         return {
             "engine": self.ENGINE,
             "bodies": structure_of(self.bodies.values()),
@@ -471,7 +464,6 @@ class SimulatedWorld(SceneEngine[B]):
         }
 
     def restore(self, state: Any) -> None:
-        """Restore a state of :meth:`save`: see :meth:`hal.world.World.restore`."""
         check_state(state, self.ENGINE, structure_of(self.bodies.values()))
         drivers = state["drivers"]
         own = {name: save() for name, (save, _) in self._kept.items() if name in (drivers or ())}

@@ -137,7 +137,6 @@ class UrLink(LibraryThread):
                 self._wake.notify()
 
     def ask_remote(self) -> None:
-        """Ask soon whether the controller is in local control."""
         self.call(self._ask_remote)
 
     def unlock(self) -> str:

@@ -43,7 +43,6 @@ class V4l2Camera(CameraDriver):
     """
 
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
-        """Check the options; raises ConfigError."""
         super().__init__(spec, source)
         self._settings = V4l2Settings.of(spec)
         self._output = PictureOutput(spec, self._settings.undistort)

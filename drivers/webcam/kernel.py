@@ -184,7 +184,6 @@ class VideoNode:
         return bool(poll.poll(1e3 * timeout))
 
     def close(self) -> None:
-        """Close it; the kernel stops streaming and frees the buffers."""
         os.close(self._file)
 
 
@@ -206,7 +205,6 @@ def is_capture(node: VideoNode) -> bool:
 
 
 def fourcc(text: str) -> int:
-    """Return the kernel's number of a format with four characters."""
     return int.from_bytes(text.encode(), "little")
 
 

@@ -31,7 +31,6 @@ class VideoCamera(CameraDriver):
     """
 
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
-        """Check the options; raises ConfigError."""
         super().__init__(spec, source)
         self._settings = VideoSettings.of(spec)
         self._output = PictureOutput(spec, self._settings.undistort)

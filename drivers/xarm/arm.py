@@ -40,8 +40,6 @@ _AT_REST = 0.02
 
 
 class XArm(RobotDriver):
-    """An arm of a UFACTORY control box, as its settings say (:class:`~.settings.XArmSettings`)."""
-
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
         self.settings = XArmSettings.of(spec)

@@ -178,7 +178,6 @@ class XArmGripper(GripperDriver):
         self._check(self._reach().gripper_modbus_clean_err())
 
     def stop(self) -> None:
-        """Stop moving fingers; what is held stays held."""
         if self._is_moving(monotonic()):
             self._ask()
             self._send(self._position)

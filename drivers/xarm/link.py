@@ -88,8 +88,6 @@ def connect(host: str, **options: Any) -> XArmAPI:
 
 
 class Report(NamedTuple):
-    """One report of port 30003."""
-
     mode: int
     state: int
     q: tuple[float, ...]
@@ -140,7 +138,6 @@ class ReportLine:
         self._line.connect_ex((self._host, REPORTS))
 
     def close(self) -> None:
-        """Disconnect. Idempotent."""
         if self._line is not None:
             self._line.close()
         self._line, self._came = None, b""
@@ -237,12 +234,10 @@ class XArmLink(LibraryThread):
         self.call(self._stop)
 
     def end(self) -> None:
-        """Send no more set-points."""
         with self._wake:
             self.ready, self._target = False, None
 
     def ask(self) -> None:
-        """Ask for errors soon."""
         self.call(self._ask)
 
     def clean(self) -> bool:

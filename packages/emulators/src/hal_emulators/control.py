@@ -26,8 +26,6 @@ CONTROL_PORT = 1339
 
 
 class Started(NamedTuple):
-    """An emulator of a rig's devices at work."""
-
     execute: Execute
     places: str
     """Where its devices are."""

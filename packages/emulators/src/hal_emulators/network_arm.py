@@ -42,7 +42,6 @@ class NetworkController:
         """What happened, the newest last."""
 
     def note(self, event: str) -> None:
-        """Keep an event, with its time."""
         self.events = [*self.events[-49:], f"{self.now:.3f} {event}"]
 
     @property
@@ -56,8 +55,6 @@ class NetworkController:
 
 
 class Client:
-    """One connection."""
-
     def __init__(self, line: socket.socket, port: int) -> None:
         self.line, self.port, self.came = line, port, b""
 
@@ -208,7 +205,6 @@ class NetworkArm:
     # Output.
 
     def send(self, client: Client, data: bytes) -> None:
-        """Send at once."""
         try:
             client.line.send(data)
         except BlockingIOError:  # a client that reads nothing misses states

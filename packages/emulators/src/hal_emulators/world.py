@@ -124,7 +124,6 @@ class ArmOfWorld:
         return [a + share * (b - a) for a, b in zip(q0, q1, strict=True)]
 
     def _drive_fingers(self) -> None:
-        """Let the fingers follow those of the emulator, or press as they do."""
         fingers, width = self._fingers, self._width
         assert fingers is not None
         assert width is not None
@@ -138,7 +137,6 @@ class ArmOfWorld:
             fingers.move(wanted[0], spec.speed, wanted[1])
 
     def finish_step(self, t: float) -> None:
-        """Find out what the fingers touch."""
         if self._fingers is None:
             return
         width = self._fingers.read(t).width

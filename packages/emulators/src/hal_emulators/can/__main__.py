@@ -28,7 +28,6 @@ _locks: list[DeviceLock] = []
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program, and return its exit status."""
     return run_emulator("can", _WHAT, help_text(COMMANDS), arguments, _start)
 
 

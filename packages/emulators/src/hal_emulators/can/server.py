@@ -151,7 +151,6 @@ class EmulatedBus:
             self._flush(time.monotonic())
 
     def stop(self) -> None:
-        """End the thread and close the bus."""
         self._end.set()
         if self._thread.is_alive():
             self._thread.join(5.0)
@@ -159,7 +158,6 @@ class EmulatedBus:
             self._bus.shutdown()
 
     def send(self, id: int, data: bytes) -> None:
-        """Send a frame now, whatever the faults."""
         fd = self.settings.fd
         message = can.Message(arbitration_id=id, is_extended_id=False, data=data, is_fd=fd, bitrate_switch=fd)
         if self._bus is not None:
@@ -280,12 +278,10 @@ class CanEmulator:
         return next(bus for bus in self.buses if arm.name in bus.arms)
 
     def start(self) -> None:
-        """Open all buses and start to answer."""
         for bus in self.buses:
             bus.start()
 
     def stop(self) -> None:
-        """End all threads and close the buses."""
         for bus in self.buses:
             bus.stop()
 

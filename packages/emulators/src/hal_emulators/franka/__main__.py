@@ -33,7 +33,6 @@ _HOME = (0.0, -0.785398163, 0.0, -2.35619449, 0.0, 1.57079633, 0.785398163)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program, and return its exit status."""
     options = _parser().parse_args(arguments)
     journal = Journal(options.quiet)
     ends = note_signals()

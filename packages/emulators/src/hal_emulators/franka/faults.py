@@ -91,8 +91,6 @@ class Unrest:
 
 
 class InjectedFaults:
-    """Faults of the server that are injected at present."""
-
     def __init__(self, seed: int) -> None:
         self.seed = seed
         self.clear()

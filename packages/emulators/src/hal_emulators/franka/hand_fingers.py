@@ -46,8 +46,6 @@ class FingerMotion:
 
 
 class Fingers:
-    """Two coupled fingers, and at most one object between them."""
-
     def __init__(self, object_width: float | None = None, homed: bool = True) -> None:
         self.width = FULL_WIDTH / 2.0
         self.homed = homed

@@ -26,8 +26,6 @@ _STATE = struct.Struct("<IddBH")
 
 
 class HandCode(IntEnum):
-    """Types of requests."""
-
     CONNECT = 0
     HOMING = 1
     GRASP = 2
@@ -54,8 +52,6 @@ class HandStatus(IntEnum):
 
 
 class HandRequest(NamedTuple):
-    """One request of a client."""
-
     code: HandCode
     id: int
     values: tuple[float, ...]
@@ -160,7 +156,6 @@ class HandNetwork:
 
     @property
     def listening(self) -> bool:
-        """Whether clients can connect."""
         return self._listener is not None
 
     def listen(self) -> None:

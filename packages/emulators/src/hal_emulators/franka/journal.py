@@ -81,7 +81,6 @@ class Counters:
             self.stalls.append((due, by))
 
     def report(self) -> dict[str, Any]:
-        """Return everything as plain values; times in s."""
         values: dict[str, Any] = {}
         for name, value in vars(self).items():
             if isinstance(value, Histogram):

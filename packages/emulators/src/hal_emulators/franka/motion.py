@@ -27,15 +27,12 @@ Floats = Sequence[float]
 
 
 class MotionSample(NamedTuple):
-    """Desired joint positions (7,), rad, and their backward differences over one cycle, rad/s and rad/s2."""
-
     q: Floats
     dq: Floats
     ddq: Floats
 
     @property
     def moving(self) -> bool:
-        """Whether any joint moves."""
         return any(self.dq)
 
 

@@ -92,8 +92,6 @@ class RequestOutcome(Enum):
 
 @dataclass(frozen=True)
 class RequestType:
-    """A type of request."""
-
     name: str
     size: int
     """Bytes, with the header."""
@@ -134,8 +132,6 @@ _RECOVERY_10 = _YES_NO | _number_outcomes(
 
 @dataclass(frozen=True)
 class FrankaProtocol:
-    """One version of the protocol."""
-
     version: int
     requests: dict[int, RequestType]
     """By code."""
@@ -211,8 +207,6 @@ class FieldSpan(NamedTuple):
 
 
 class PacketLayout:
-    """Named fields of one type of packet."""
-
     def __init__(self, fields: Iterable[tuple[str, int, str]]) -> None:
         self.fields: dict[str, PacketField] = {}
         self.size = 0
@@ -322,7 +316,6 @@ class StatePacket:
         span.struct.pack_into(self.buffer, span.offset, *values)
 
     def get(self, name: str) -> tuple[float, ...]:
-        """Return the values of one field."""
         span = self._spans[name]
         return span.struct.unpack_from(self.buffer, span.offset)
 
@@ -343,13 +336,10 @@ class StatePacket:
         self._motors.struct.pack_into(self.buffer, self._motors.offset, *values)
 
     def put_modes(self, generator: int, controller: int) -> None:
-        """Write the modes of motion generator and controller."""
         self._modes.struct.pack_into(self.buffer, self._modes.offset, generator, controller)
 
 
 class CommandPacket(NamedTuple):
-    """A client's answer to a state."""
-
     message_id: int
     q: tuple[float, ...]
     dq: tuple[float, ...]

@@ -46,8 +46,6 @@ SETTERS: dict[str, tuple[str, tuple[tuple[str, int], ...]]] = {
 
 
 class ClientSettings:
-    """Settings since the robot was started."""
-
     def __init__(self, with_hand: bool) -> None:
         self.with_hand = with_hand
         self.given: dict[str, dict[str, Any]] = {}

@@ -45,7 +45,6 @@ class SoftwareCamera:
 
     @property
     def plugged(self) -> bool:
-        """Whether it is plugged in."""
         return self._device is not None
 
     def attach(self, context: Any) -> None:
@@ -96,7 +95,6 @@ class SoftwareCamera:
 
     @property
     def streaming(self) -> bool:
-        """Whether any stream is on, as far as the feeding thread has noticed."""
         return bool(self._feeder.modes)
 
     @property

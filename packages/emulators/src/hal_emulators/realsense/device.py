@@ -141,7 +141,6 @@ class EmulatedDevice:
         return dict(map(self.identify, [*self._stereo.get_active_streams(), *self._color.get_active_streams()]))
 
     def identify(self, profile: Any) -> tuple[str, StreamMode]:
-        """Return the stream and the mode of a profile of the library."""
         video = profile.as_video_stream_profile()
         kind = (profile.stream_type().name, profile.stream_index())
         name = next(name for name, known in _KINDS.items() if known == kind)
@@ -213,11 +212,9 @@ class DevicesRemoved:
         self._ports = ports
 
     def was_removed(self, device: Any) -> bool:
-        """Return whether a device is among the removed ones."""
         return _read_port(device) in self._ports
 
     def was_added(self, device: Any) -> bool:
-        """Return False: the library itself announces new devices."""
         return False
 
     def get_new_devices(self) -> list[Any]:
@@ -273,8 +270,6 @@ def emulated_context() -> Any:
 
 
 class ContextEntry:
-    """A device's entry in an :func:`emulated_context`, until it is removed."""
-
     def __init__(self, context: Any, device: EmulatedDevice) -> None:
         self._context = context
         self._device = device

@@ -30,8 +30,6 @@ _ORDER = ("depth", "infrared", "infrared_right", "color")
 
 
 class SentFrames(NamedTuple):
-    """Times of one frame set."""
-
     number: int
     stamp: float
     """When it was taken, on the clock of its stamps, s."""
@@ -47,7 +45,6 @@ class FrameFeeder:
     """
 
     def __init__(self, spec: CameraSpec, emulation: Emulation) -> None:
-        """Start the thread."""
         self.emulation = emulation
         self.streams = make_streams(spec)
         self.images = EmulatedImages(self.streams, emulation.pattern, emulation.seed)

@@ -40,8 +40,6 @@ class PinholeLens(NamedTuple):
 
 
 class StreamMode(NamedTuple):
-    """One mode of a stream."""
-
     width: int
     height: int
     rate: int

@@ -20,7 +20,6 @@ _WHAT = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program, and return its exit status."""
     return run_emulator("robotiq", _WHAT, help_text(COMMANDS), arguments, _start)
 
 

@@ -47,7 +47,6 @@ class EmulatedGripper:
 
     @property
     def width(self) -> float:
-        """Width, m."""
         return self.spec.width_at((self.closed - self.position) / (self.closed - self.opened))
 
     @property
@@ -96,7 +95,6 @@ class EmulatedGripper:
         return request.act, request.gto, self.state, self.object, self.fault, request.pr, round(self.position)
 
     def advance(self, dt: float) -> None:
-        """Let ``dt`` s pass."""
         if not self.powered:
             return
         if self._way:

@@ -81,8 +81,6 @@ class Port:
 
 
 class SerialPort(Port):
-    """Modbus RTU on a pseudo terminal, to which the name of the port leads."""
-
     def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:
         super().__init__(gripper, seed)
         self._terminal = PseudoTerminal(str(gripper.settings.port))
@@ -137,8 +135,6 @@ class SerialPort(Port):
 
 
 class TextPort(Port):
-    """The text port of Robotiq's URCap; its answers have no end of line."""
-
     _VARIABLES = ("ACT", "GTO", "STA", "OBJ", "FLT", "PRE", "POS")
 
     def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:

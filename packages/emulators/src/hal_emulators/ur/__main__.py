@@ -17,7 +17,6 @@ HOME = (0.0, -1.669, 1.659, -1.56, -1.571, 0.0)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program, and return its exit status."""
     what = "Emulates the controller of a Universal Robots arm for ur_rtde."
     parser = make_parser("ur", what, help_text(COMMANDS))
     add = parser.add_argument

@@ -78,7 +78,6 @@ class Controller(NetworkController):
     # Programs.
 
     def upload(self, text: str) -> None:
-        """Run a script that came on the script port."""
         found = re.search(r"^\s*def\s+(\w+)", text)
         if found is None:
             return
@@ -98,7 +97,6 @@ class Controller(NetworkController):
             self.motion.stop(_PROGRAM_STOP)
 
     def write_inputs(self, values: dict[str, float]) -> None:
-        """Take what a client wrote into the registers."""
         self.inputs.update(values)
         if f"input_int_register_{self.offset}" in values:
             self._t_written = self.now
@@ -219,7 +217,6 @@ class Controller(NetworkController):
     # Each cycle.
 
     def step(self) -> None:
-        """Let a cycle pass."""
         self.now += self.dt
         if self._starts is not None and self.now >= self._starts[0]:
             _, self.program, self.offset = self._starts

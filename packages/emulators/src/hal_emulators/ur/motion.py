@@ -113,7 +113,6 @@ class TargetMotion:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the motion that was started is over."""
         return self._kind in ("hold", "servo")
 
     def step(self) -> str | None:

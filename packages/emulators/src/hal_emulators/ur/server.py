@@ -92,8 +92,6 @@ def _type_of(name: str) -> str:
 
 
 class _Recipe:
-    """The variables of one kind of packet."""
-
     def __init__(self, names: list[str]) -> None:
         self.names = names
         self.formats = [_FORMATS[_type_of(name)] for name in names]
@@ -129,8 +127,6 @@ class _Client(Client):
 
 
 class UrServer(NetworkArm):
-    """The ports of a UR's controller."""
-
     PORTS: ClassVar = (RTDE, DASHBOARD, *SCRIPTS)
     COMMANDS: ClassVar = COMMANDS
     client: ClassVar = _Client

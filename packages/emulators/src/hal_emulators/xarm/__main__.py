@@ -21,7 +21,6 @@ HOMES = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program, and return its exit status."""
     what = "Emulates the control box of a UFACTORY arm for xarm-python-sdk."
     parser = make_parser("xarm", what, help_text(COMMANDS))
     parser.add_argument("--robot", choices=sorted(ROBOTS), default="xarm7", help="which arm (%(default)s)")

@@ -41,8 +41,6 @@ _BEYOND = math.radians(0.1)
 
 
 class Robot(NamedTuple):
-    """An arm."""
-
     kind: int
     """Its number in the SDK."""
     rows: tuple[tuple[float, float, float, float], ...]
@@ -145,7 +143,6 @@ class Controller(NetworkController):
 
     @property
     def ready(self) -> bool:
-        """Whether it takes commands to move."""
         return self.enabled and not self.error and not self._halted
 
     # Commands.
@@ -163,7 +160,6 @@ class Controller(NetworkController):
             self._halt(CHANGED)
 
     def take_over(self, mode: int) -> None:
-        """Be used by another program, in a mode."""
         self.set_mode(mode)
         self.set_state(0)
 
@@ -201,7 +197,6 @@ class Controller(NetworkController):
         self._halt(STOPPED)
 
     def clean_error(self) -> None:
-        """Clear the error; a pressed emergency stop causes it again."""
         self.error = 1 if self.pressed else 0
 
     def press(self, pressed: bool) -> None:

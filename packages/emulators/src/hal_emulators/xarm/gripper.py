@@ -33,12 +33,10 @@ class Gripper:
 
     @property
     def width(self) -> float:
-        """Distance between the fingers, m."""
         return width_at(self.position)
 
     @property
     def holds(self) -> bool:
-        """Whether an object stops the fingers."""
         return self.object_width is not None and self.target < self.position and self.width <= self.object_width
 
     def step(self, dt: float) -> None:
@@ -54,7 +52,6 @@ class Gripper:
             self.fail(23)
 
     def fail(self, error: int) -> None:
-        """Raise an error, which switches it off."""
         self.error, self.enabled = error, False
 
     def answer(self, frame: bytes) -> bytes | None:

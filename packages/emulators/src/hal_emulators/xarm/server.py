@@ -77,8 +77,6 @@ COMMANDS = make_commands(
 
 
 class XArmServer(NetworkArm):
-    """The ports of a control box."""
-
     PORTS: ClassVar = (ORDERS, *_PERIODS)
     COMMANDS: ClassVar = COMMANDS
     controller: Controller
@@ -146,7 +144,6 @@ class XArmServer(NetworkArm):
     # Output.
 
     def publish(self) -> None:
-        """Send the reports that are due."""
         self._cycle += 1
         made: dict[int, bytes] = {}
         for client in list(self.clients):
