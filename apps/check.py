@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, TextIO
+from functools import partial
+from typing import TYPE_CHECKING
 
 from hal import registry
 from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, program
+from hal.apps._display import StatusLine
 from hal.errors import CommandError, HalError
 
 if TYPE_CHECKING:
@@ -89,14 +91,10 @@ def show_can() -> bool:
 
 _RATE = 50.0
 """Rate at which pads are polled, Hz."""
-_DRAW_PERIOD = 0.1
-"""s between two updates of a terminal."""
 _SCAN_PERIOD = 1.0
 """s between two searches for plugged-in pads."""
 _STEP = 0.05
 """Change of an axis that is printed as a new line when there is no terminal."""
-_LINES = 12
-"""Height of a terminal that does not report it: a value that fits into any."""
 _INDENT = " " * 10
 _REAL = ("auto", "evdev")
 
@@ -104,23 +102,30 @@ _REAL = ("auto", "evdev")
 def show_pads(specs: Sequence[PadSpec], duration: float | None) -> bool:
     """Show these pads, or all that are plugged in, as they come and go; for ``duration`` s, or until Ctrl-C.
 
+    On a terminal one live line has their values, elsewhere each change is a line.
+
     Returns:
         Whether there was a pad that can be read.
     """
+    live, line = sys.stdout.isatty(), StatusLine()
+    say = line.event if live else partial(print, flush=True)  # which ends with a pipe that is closed
+    printed: dict[str, tuple[PadState, tuple[str, ...]]] = {}
     with _PadMonitor(specs) as pads:
-        screen = _Screen(sys.stdout)
         end = time.monotonic() + duration if duration is not None else None
         for text in pads.start():
-            screen.print(text)
-        try:
+            say(text)
+        with suppress(KeyboardInterrupt):
             while end is None or time.monotonic() < end:
                 for text in pads.poll():
-                    screen.print(text)
-                screen.show(pads.open)
+                    say(text)
+                line.update(lambda: "   ".join(_describe_values(name, pad) for name, pad in pads.open.items()))
+                for name, pad in () if live else pads.open.items():
+                    now = pad.state(), pad.waiting_for
+                    if name not in printed or now[1] != printed[name][1] or _differ(now[0], printed[name][0]):
+                        printed[name] = now
+                        say(_describe_values(name, pad))
                 time.sleep(1.0 / _RATE)
-        except KeyboardInterrupt:
-            pass
-        screen.end()
+        line.clear()
         return pads.found
 
 
@@ -221,55 +226,6 @@ def _about(pad: Gamepad) -> str:
     return "\n".join([*lines, *pad.notes])
 
 
-class _Screen:
-    """Output: on a terminal one block that is redrawn, elsewhere a line for every change."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._live = stream.isatty()
-        self._next = 0.0
-        self._drawn = 0
-        self._printed: dict[str, tuple[PadState, tuple[str, ...]]] = {}
-
-    def print(self, text: str) -> None:
-        """Print lines above the block."""
-        self._clear()
-        self._write(text + "\n")
-
-    def show(self, pads: Mapping[str, Gamepad]) -> None:
-        """Show the values of all pads."""
-        if not self._live:
-            for name, pad in pads.items():
-                self._print_changes(name, pad)
-        elif time.monotonic() >= self._next:
-            self._next = time.monotonic() + _DRAW_PERIOD
-            size = shutil.get_terminal_size((80, _LINES))
-            lines = [line for name, pad in pads.items() for line in _block(name, pad)]
-            self._clear()
-            shown = [line[: size.columns - 1] for line in lines[: size.lines - 1]]
-            self._write("".join(f"{line}\n" for line in shown))
-            self._drawn = len(shown)
-
-    def end(self) -> None:
-        """Leave the last values on the screen."""
-        self._drawn = 0
-
-    def _print_changes(self, name: str, pad: Gamepad) -> None:
-        now, before = (pad.state(), pad.waiting_for), self._printed.get(name)
-        if before is None or now[1] != before[1] or _differ(now[0], before[0]):
-            self._printed[name] = now
-            self._write(f"{name}: {_describe_values(*now)}\n")
-
-    def _clear(self) -> None:
-        if self._drawn:
-            self._write(f"\x1b[{self._drawn}A\x1b[J")
-            self._drawn = 0
-
-    def _write(self, text: str) -> None:
-        self._stream.write(text)
-        self._stream.flush()
-
-
 def _differ(now: PadState, before: PadState) -> bool:
     """Whether the difference of two states deserves another line."""
     if (now.buttons, now.connected) != (before.buttons, before.connected):
@@ -278,40 +234,17 @@ def _differ(now: PadState, before: PadState) -> bool:
     return any(abs(new - old) >= _STEP or (new == 0.0) != (old == 0.0) for new, old in pairs)
 
 
-def _describe_values(state: PadState, waiting_for: Sequence[str]) -> str:
+def _describe_values(name: str, pad: Gamepad) -> str:
     """Return the values of a pad in one line."""
+    state = pad.state()
     if not state.connected:
-        return "not plugged in"
+        return f"{name}: not plugged in"
     parts = [f"{name} {value:+.2f}" for name, value in state.axes.items() if value]
     if state.buttons:
         parts.append(f"[{' '.join(sorted(state.buttons))}]")
-    if waiting_for:
-        parts.append(f"release, or move once: {', '.join(waiting_for)}")
-    return "  ".join(parts) or "at rest"
-
-
-def _block(name: str, pad: Gamepad) -> list[str]:
-    """Return the values of one pad as lines of the block."""
-    shown = pad.state()
-    if not shown.connected:
-        return [f"{name}: not plugged in"]
-    lines = [f"{name}:"]
-    reported = [(axis, value) for axis, value in shown.axes.items() if axis in pad.reported]
-    bars = [f"{axis:8s} {value:+5.2f} {_bar(value)}" for axis, value in reported]
-    lines += ["  " + "   ".join(bars[at : at + 2]) for at in range(0, len(bars), 2)]
-    lines.append(f"  pressed  {' '.join(sorted(shown.buttons)) or '-'}")
     if pad.waiting_for:
-        lines.append(f"  release, or move once: {', '.join(pad.waiting_for)}")
-    return lines
-
-
-def _bar(value: float) -> str:
-    """Return a value of -1..1 as a bar from the middle."""
-    half = 8
-    filled = round(abs(value) * half)
-    left = ("#" * filled if value < 0.0 else "").rjust(half)
-    right = ("#" * filled if value > 0.0 else "").ljust(half)
-    return f"[{left}|{right}]"
+        parts.append(f"release, or move once: {', '.join(pad.waiting_for)}")
+    return f"{name}: {'  '.join(parts) or 'at rest'}"
 
 
 # --physics: experiments in the simulated world, beside theory.
