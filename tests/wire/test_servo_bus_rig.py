@@ -55,7 +55,10 @@ def tour(rig: hal.Rig, poses: Sequence[list[float]]) -> list[hal.RobotState]:
     return found
 
 
-def test_the_tour_ends_at_the_poses_of_the_simulation_and_the_arm_holds_afterwards(emulator: ServoBusProcess) -> None:
+@pytest.mark.parametrize("run", range(10 if os.environ.get("HAL_SOAK") else 1))
+def test_the_tour_ends_at_the_poses_of_the_simulation_and_the_arm_holds_afterwards(
+    emulator: ServoBusProcess, run: int
+) -> None:
     poses = POSES[emulator.rig]
     with hal.open(emulator.rig, sim=True, clock="lock_step", overrides=emulator.overrides) as rig:
         simulated = tour(rig, poses)
@@ -67,7 +70,7 @@ def test_the_tour_ends_at_the_poses_of_the_simulation_and_the_arm_holds_afterwar
         assert figures["robots"]["arm"]["driver"]["faults"] == 0
     off = max(float(np.abs(a.q - b.q).max()) for a, b in zip(real, simulated, strict=True))
     apart = max(a.tcp.distance(b.tcp)[0] for a, b in zip(real, simulated, strict=True))
-    print(f"{1e3 * apart:.2f} mm, {off:.4f} rad, period p50 {figures['period_s']['p50']:.4f} s")
+    print(f"run {run}: {1e3 * apart:.2f} mm, {off:.4f} rad, period p50 {figures['period_s']['p50']:.4f} s")
     assert off < 0.01
     assert apart < 0.002
     assert figures["period_s"]["p50"] == pytest.approx(0.01, rel=0.05)
