@@ -32,7 +32,7 @@ _RETRY = 0.25
 _STIR, _REST = 0.01, 1.0
 """A leader without any dead-man counts as held from a motion of so many rad on, until it rests for so many s."""
 _HEARD = 0.15
-"""Time for which a leader follows what it was given last, s."""
+"""Time for which a leader follows, or feels, what it was given last, s."""
 _AWAY = PadReading(-math.inf, -math.inf, 0.0, 0, MappingProxyType({}), frozenset(), connected=False)
 
 
@@ -48,7 +48,7 @@ class Angles(NamedTuple):
 
 
 class LeaderDriver(GamepadDriver):
-    """Driver of one leader arm. It never moves a motor, and never writes to one, unless it shall follow the arm."""
+    """Driver of one leader arm. It never moves a motor or writes to one, but to follow the arm or to push the hand."""
 
     proves_liveness = True
 
@@ -68,6 +68,8 @@ class LeaderDriver(GamepadDriver):
         self._t_moved = -math.inf
         self._wanted: tuple[float, Sequence[float]] | None = None
         """When it was given joint positions to follow, by the monotonic clock, s, and these, rad."""
+        self._felt: tuple[float, Sequence[float]] | None = None
+        """When it was given torques to feel, by the monotonic clock, s, and these, Nm."""
 
     def follow(self, q: Sequence[float] | None) -> None:
         """Come to these joint positions (n,), rad, if it may move; for 0.15 s, if no others come. Any thread.
@@ -76,12 +78,22 @@ class LeaderDriver(GamepadDriver):
         """
         self._wanted = None if q is None else (monotonic(), q)
 
+    def feel(self, torques: Sequence[float] | None) -> None:
+        """Push the hand with these torques of the joints (n,), Nm, if it can; for 0.15 s, if no others come.
+
+        None: let it go. Any thread.
+        """
+        self._felt = None if torques is None else (monotonic(), torques)
+
     @property
     def wanted(self) -> Sequence[float] | None:
         """Joint positions to follow at the moment (n,), rad; None for none."""
-        given = self._wanted
-        fresh = given is not None and self.leader.follow > 0.0 and monotonic() - given[0] < _HEARD
-        return given[1] if given is not None and fresh else None
+        return _find_fresh(self._wanted) if self.leader.follow > 0.0 else None
+
+    @property
+    def felt(self) -> Sequence[float] | None:
+        """Torques to push the hand with at the moment (n,), Nm; None for none."""
+        return _find_fresh(self._felt) if self.leader.feedback > 0.0 else None
 
     @abstractmethod
     def read_angles(self, now: float) -> Angles:
@@ -181,6 +193,11 @@ class LeaderDriver(GamepadDriver):
         if self.is_open:
             self.is_open = False
             self._lose(self._reading.t, "it is not open")
+
+
+def _find_fresh(given: tuple[float, Sequence[float]] | None) -> Sequence[float] | None:
+    """Return what was given with this time of the monotonic clock, s; None if that was too long ago."""
+    return given[1] if given is not None and monotonic() - given[0] < _HEARD else None
 
 
 class Leader(Gamepad):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from .commands import CartesianTarget, JointTarget, JointVelocity
 from .config.mapping import TeleopMapping
-from .errors import CommandError
+from .errors import CommandError, StaleStateError
 from .geometry import Pose
 from .kinematics.arm import Kinematics
 from .leader import Leader, LeaderDriver
@@ -34,6 +35,8 @@ _REACH = 0.999
 """Share of the arm's reach that a pose may have."""
 STATE_AGE = 2.0
 """Greatest age of a state to start from, s."""
+_FRESH = 0.1
+"""Greatest age of a state whose torques the hand feels, s."""
 
 
 class HandTeleop(Teleop):
@@ -142,6 +145,7 @@ class LeaderTeleop(HandTeleop):
 
     def watch(self) -> None:
         """Let a leader that may move follow an arm that it leads joint to joint."""
+        self._driver.feel(None)
         if self._kinematics is None and self.spec.follow > 0.0:
             self._driver.follow(self.robot.state(STATE_AGE).q_set.tolist())
 
@@ -161,7 +165,20 @@ class LeaderTeleop(HandTeleop):
             ConnectionLost: The arm does not answer.
         """
         self._driver.follow(None)
-        return self._follow(pad.joints, pad, dt)
+        command = self._follow(pad.joints, pad, dt)
+        self._driver.feel(self._find_feedback())
+        return command
+
+    def _find_feedback(self) -> list[float] | None:
+        """Return the torques that the hand is to feel, Nm; None while the arm does not follow, or does not know any."""
+        if self._anchor is None or self._kinematics is not None or self.spec.feedback == 0.0:
+            return None
+        with suppress(StaleStateError):
+            state = self.robot.state(_FRESH)
+            felt = state.tau_ext
+            if state.status is RobotStatus.FOLLOWING and felt is not None and np.isfinite(felt).all():
+                return [self.spec.feedback * torque for torque in felt.tolist()]
+        return None
 
     def _make_anchor(self, where: tuple[float, ...], state: RobotState) -> _Anchor:
         joints = np.array(where)

@@ -373,6 +373,8 @@ class LeaderSpec:
     """Gamepad of the rig that must be held; None for the lever, or for no dead-man at all."""
     follow: float = 0.0
     """Share of its motors' torque with which it follows the arm while a policy drives it; 0: it never does."""
+    feedback: float = 0.0
+    """Torque of its joints for each Nm of external torque on the arm's while it leads joint to joint; 0: none."""
     emulated: bool = False
 
     @property

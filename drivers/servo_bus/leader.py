@@ -1,4 +1,4 @@
-"""Drivers of leader arms on a servo bus: their motors have no torque, but while they follow an arm, where they may."""
+"""Drivers of leader arms on a servo bus: their motors have torque only to follow an arm or to push the hand."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from .settings import PROTOCOLS, MotorId, ServoSettings, check_baud
 
 _WIDEST = 3.0
 """Widest range of a calibrated lever, rad."""
+_FORCE, _RISE = 0.3, 0.1
+"""Greatest torque that the hand feels, share of the stall torque, and time in which it may rise to that, s: chosen."""
 _SPEED, _LEAD, _MOVED = 0.5, 0.3, 40
 """Speed at which the goals of a leader that follows come to the arm's joints, rad/s, how far they are ahead of it at
 most, rad, and how far it may be moved while its torque is switched on, counts: chosen."""
@@ -51,6 +53,12 @@ def check_leader(spec: PadSpec) -> Iterator[tuple[str, str, str]]:
         yield "options.ids", f"has {len(settings.ids)} motors for {len(spec.leader.joints)} joints", "wrong_count"
     if settings.lever is None and spec.leader.lever != "none":
         yield "options.lever", "is missing: the id of its motor; or set lever: none", "missing_key"
+    if spec.leader.feedback and PROTOCOLS[spec.driver].name != "Dynamixel":
+        yield (
+            "feedback",
+            f"a {PROTOCOLS[spec.driver].name} motor has no small torques: a Dynamixel leader has",
+            "unsupported",
+        )
     motors = len(settings.ids) + (settings.lever is not None)
     yield from (("options.baud", *problem) for problem in check_baud(spec.driver, motors, settings.baud))
 
@@ -70,8 +78,10 @@ class ServoLeader(LeaderDriver):
         self.chain = Chain(spec.name, self.protocol, bus, joints, watch=False)
         self._goal: Sequence[float] = ()
         """Joint positions that it comes to, rad."""
-        self._mine, self._t_driven = False, 0.0
-        """Whether its torque was switched on here, and when goals were written, s."""
+        self._mine, self._t_driven = 0.0, 0.0
+        """Share of its torque that was switched on here, and when goals were written, s."""
+        self._pushes: Sequence[float] = ()
+        """By how much goals are ahead of the joints so that the hand feels a torque, rad."""
 
     def read_angles(self, now: float) -> Angles:
         chain = self.chain
@@ -115,34 +125,55 @@ class ServoLeader(LeaderDriver):
         return min(max((self._opened - angle) / (self._opened - self._closed), 0.0), 1.0)
 
     def _drive(self, states: Sequence[MotorState], here: Sequence[float], now: float) -> None:
-        """Come to the joints of an arm with little torque and at a bounded speed; let go if there is none to follow."""
-        wanted, chain = self.wanted, self.chain
-        if wanted is not None and (fault := chain.fault(states)) is not None:
+        """Come to the joints of an arm, or push the hand, with little torque; let go if there is nothing to do."""
+        wanted, felt, chain = self.wanted, self.felt, self.chain
+        share = self.leader.follow if wanted is not None else 0.0 if felt is None else _FORCE
+        if share and (fault := chain.fault(states)) is not None:
             raise ConnectionLost.of(self.spec.name, fault)
         states = states[: len(here)]
-        if wanted is None:
-            if self._mine:
-                chain.switch(False, len(here))
-                self._mine = any(state.on for state in states)
-        elif not (self._mine and all(state.on and not state.stopped for state in states)):
-            self._switch_on(states, here)
-        else:
-            step, goals = _SPEED * min(now - self._t_driven, 0.1), []
-            for goal, q, end in zip(self._goal, here, wanted, strict=True):
-                goal += min(max(end - goal, -step), step)
-                goals.append(min(max(goal, q - _LEAD), q + _LEAD))
-            ways = [(b - a) / gain / COUNT for a, b, gain in zip(here, goals, self.leader.gains, strict=True)]
-            self._goal = goals
+        if self._mine not in (0.0, share):
+            chain.switch(False, len(here))
+            if not any(state.on for state in states):
+                self._mine = 0.0
+        elif share and not (self._mine and all(state.on and not state.stopped for state in states)):
+            self._switch_on(states, here, share)
+        elif share:
+            dt, gains = min(now - self._t_driven, 0.1), self.leader.gains
+            goals = self._approach(here, wanted, dt) if wanted is not None else self._push(here, felt or (), dt)
+            ways = [(b - a) / gain / COUNT for a, b, gain in zip(here, goals, gains, strict=True)]
             chain.write_goals(self._clip([state.position + way for state, way in zip(states, ways, strict=True)]))
         self._t_driven = now
 
-    def _switch_on(self, states: Sequence[MotorState], here: Sequence[float]) -> None:
+    def _approach(self, here: Sequence[float], wanted: Sequence[float], dt: float) -> Sequence[float]:
+        """Return goals that come to the joints of an arm at a bounded speed, rad."""
+        step, goals = _SPEED * dt, []
+        for goal, q, end in zip(self._goal, here, wanted, strict=True):
+            goal += min(max(end - goal, -step), step)
+            goals.append(min(max(goal, q - _LEAD), q + _LEAD))
+        self._goal = goals
+        return goals
+
+    def _push(self, here: Sequence[float], felt: Sequence[float], dt: float) -> Sequence[float]:
+        """Return goals that are ahead of the joints by the torques that the hand is to feel over their stiffness, rad.
+
+        What a program leaves that is killed is so a motor that holds near where it is, not one that turns on for ever.
+        """
+        pushes = []
+        for push, torque, gain, r in zip(self._pushes, felt, self.leader.gains, self.chain.registers, strict=False):
+            most, unit = abs(gain) * _FORCE * r.stall_torque / r.stiffness, gain * gain / r.stiffness
+            step = most * dt / _RISE
+            push += min(max(min(max(unit * torque, -most), most) - push, -step), step)
+            pushes.append(push)
+        self._pushes = pushes
+        return [q + push for q, push in zip(here, pushes, strict=True)]
+
+    def _switch_on(self, states: Sequence[MotorState], here: Sequence[float], share: float) -> None:
         """Give the motors their positions as goals, then, if they have these and are still there, their torque."""
-        most = round(self.leader.follow * self.protocol.full)
+        most = round(share * self.protocol.full)
         limits = [min(most, registers.limit_max) for registers in self.chain.registers[: len(states)]]
         ready = [(s.torque_limit, abs(s.goal - s.position) < _MOVED) for s in states]
         if ready == [(limit, True) for limit in limits]:
-            self._goal, self._mine = here, True
+            self._goal, self._pushes, self._mine = here, [0.0] * len(here), share
             self.chain.switch(True, len(states))
         else:
             self.chain.prepare(self._clip([state.position for state in states]), limits)
@@ -161,7 +192,7 @@ class ServoLeader(LeaderDriver):
         if self._mine and bus is not None:
             with suppress(ConnectionLost):
                 off = [any(bus.store(id, self.protocol.torque, b"\0") for _ in range(3)) for id in self.settings.ids]
-                self._mine = not all(off)
+                self._mine *= not all(off)
         self.chain.close()
 
     def close(self) -> None:

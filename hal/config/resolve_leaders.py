@@ -89,8 +89,9 @@ def _make_leader(context: Context, key: str, config: LeaderConfig, model: Leader
         context.report(f"{key}.signs", "must be 1 or -1 each", "out_of_range")
     lever = config.lever or ("none" if config.deadman and model.lever == "deadman" else model.lever)
     deadman = config.deadman or (next(iter(context.rig.gamepads), None) if lever != "deadman" else None)
-    if config.follow and deadman is None and lever != "deadman":
-        context.report(f"{key}.follow", "needs a dead-man: a leader without one leads by moving", "conflict")
+    for what in ("follow", "feedback"):
+        if getattr(config, what) and deadman is None and lever != "deadman":
+            context.report(f"{key}.{what}", "needs a dead-man: a leader without one leads by moving", "conflict")
     kinematics = _find_kinematics(context, key, config, model)
     if context.problems.found:
         return None
@@ -107,6 +108,7 @@ def _make_leader(context: Context, key: str, config: LeaderConfig, model: Leader
         lever=lever,
         deadman=deadman,
         follow=config.follow,
+        feedback=config.feedback,
     )
 
 
@@ -124,6 +126,9 @@ def _find_kinematics(context: Context, key: str, config: LeaderConfig, model: Le
     if config.engage == "approach":
         message = f"{others[0]} is led by poses, of which only the changes count: use clutch"
         context.report(f"{key}.engage", message, "conflict")
+    if config.feedback:
+        message = f"{others[0]} is led by poses: only an arm that is led joint to joint gives torques back"
+        context.report(f"{key}.feedback", message, "conflict")
     driver = registry.pad_driver("program")
     own = Context(context.source, context.base, context.rig, None, driver, None, context.problems)
     arm = resolve_robot(own, "leader", RobotConfig(model=model.arm))

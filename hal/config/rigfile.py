@@ -414,6 +414,8 @@ class LeaderConfig(LeaderJoints, ServedDevice):
     """Way of the arm's tcp for each m of the leader's, if it leads by poses."""
     follow: Annotated[float, Quantity("", 0.0, 0.5)] = 0.0
     """Share of its motors' torque with which the leader follows the arm while a policy drives it; 0: it never does."""
+    feedback: Annotated[float, Quantity("", 0.0, 1.0)] = 0.0
+    """Force feedback: torque of the leader's joints for each Nm of external torque on the arm's while it leads."""
 
 
 def _check_engine(name: str) -> str:

@@ -6,8 +6,10 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from time import monotonic
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -15,6 +17,7 @@ import pytest
 from servo_bus_kit import SteppedServos, so101_leader
 from waiting import wait_until
 
+import hal
 from hal.config import load
 from hal.driver import PadReading
 from hal.drivers.servo_bus import bus
@@ -200,6 +203,78 @@ def test_a_leader_that_may_not_follow_never_has_torque(far: SteppedServos, follo
         assert not other.run(30, AWAY, lambda: any(other.on()))
     with pytest.raises(ConfigError, match="leaders.lead.follow: needs a dead-man"):
         so101_leader(far, follow=0.3)
+    with pytest.raises(ConfigError, match="leaders.lead.feedback: a Feetech motor has no"):
+        so101_leader(far, feedback=0.3, lever="deadman")
+
+
+def test_the_hand_feels_a_bounded_share_of_the_arms_external_torques_while_it_leads(tmp_path: Path) -> None:
+    """From ``hal.open`` to the goals of the leader's motors: by its signs; none before, after, and once it is lost."""
+    leader = {"model": "gello_franka", "port": str(tmp_path / "gello.emulated"), "options": {"lever_deg": [223, 180]}}
+    arm = {"model": "panda", "drivers": {"sim": "mock"}}
+    rig = {"sim": True, "robots": {"arm": arm}, "gamepads": {"pad": {"sim": True}}}
+    rig["leaders"] = {"lead": leader | {"feedback": 0.1}}
+    with (
+        ServoBusEmulator(find_leaders(rig), paced=False) as far,
+        patch.multiple(bus, _ANSWER=2.0),
+        hal.open(rig, clock="lock_step") as opened,
+    ):
+        robot, pad = opened.robots["arm"], opened.driver("pad")
+        far.execute("hand 0.1 0 0.3 0 -1.9 0 1.6 0")
+        session = hal.TeleopSession(opened, [robot])
+        far.arms["lead"].plant.step = lambda dt, drives: None  # a hand that holds it firmly
+
+        def drive(seconds: float, turn: Callable[[], object] = lambda: None) -> dict[str, Any]:
+            """Drive for some time, and return the state of the leader."""
+            end = opened.clock.now() + seconds
+
+            def until(_: hal.PadState) -> str:
+                turn()
+                far.advance(0.01)
+                return "over" if opened.clock.now() > end else ""
+
+            session.run(until)
+            return far.execute("state")
+
+        def note() -> None:
+            state = far.execute("state")
+            if all(state["on"][:7]):
+                seen.append([goal - count for count, goal in zip(state["counts"], state["goals"], strict=True)])
+
+        seen: list[list[int]] = []
+        opened.driver("arm").inject(tau_ext=[6.0, 0.0, 0.0, 0.0, 0.0, 6.0, 500.0])
+        assert not any(drive(0.3)["on"]), "it does not lead yet"
+        state = drive(0.6, lambda: (pad.press("l2"), note()))
+        assert state["limits"][:7] == [266] * 7, "the motors themselves keep to 0.3 of their torque"
+        assert not state["on"][7], "the lever"
+        pushes = seen[-1]
+        counts, most = 885 * 128 / 800 / 10.6, 0.3 * 885 * 128 / 800  # for 1 Nm of an XM540, and at most
+        assert pushes[0] == pytest.approx(0.6 * counts, abs=1), "0.1 of 6 Nm"
+        assert pushes[5] == pytest.approx(-0.6 * counts, abs=1), "this joint's sign is -1"
+        assert pushes[6] == pytest.approx(most, abs=1)
+        assert max(abs(b[6] - a[6]) for a, b in pairwise(seen)) < 0.5 * most, "no leap"
+        assert not any(drive(0.1, lambda: pad.release("l2"))["on"]), "it does not lead any more"
+        held: list[bool] = []
+
+        def lose_torques() -> None:
+            pad.press("l2")
+            held.append(all(far.execute("state")["on"][:7]))
+            if held[-1]:
+                opened.driver("arm").inject(tau_ext=None)
+
+        assert not any(drive(0.6, lose_torques)["on"]), "no torques are known"
+        assert any(held)
+        pad.release("l2")
+        drive(0.1)
+        opened.driver("arm").inject(tau_ext=[3.0] * 7)
+        assert all(drive(0.6, lambda: pad.press("l2"))["on"][:7])
+        far.execute("unplug on")
+        drive(0.1)
+        assert not opened.gamepads["lead"].state().connected
+        pad.release("l2")
+        far.execute("unplug off")
+        assert not any(drive(1.0)["on"]), "plugged in again"
+        assert all(drive(0.6, lambda: pad.press("l2"))["on"][:7])
+    assert not any(far.execute("state")["on"]), "the program ended"
 
 
 def test_an_emulated_leader_may_not_lead_a_real_arm(leader: ServoLeader) -> None:
