@@ -41,7 +41,7 @@ ELSEWHERE = {
         f"{SYSTEM}remote.py::test_a_link_that_stalls_stops_the_arm_until_it_is_acknowledged",
     ),
     "that link is cut": (
-        f"{SYSTEM}remote.py::test_a_link_that_is_cut_ends_the_program_and_a_new_one_moves_nothing_by_itself",
+        f"{SYSTEM}remote.py::test_a_link_that_is_lost_ends_the_program_and_a_new_one_moves_nothing_by_itself",
         f"{SYSTEM}remote.py::test_a_program_that_freezes_or_is_killed",
         f"{SYSTEM}remote.py::test_a_server_that_is_killed_leaves_nothing_and_the_next_call_says_so",
     ),
