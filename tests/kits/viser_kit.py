@@ -28,7 +28,8 @@ class PlainPage:
     def __init__(self, address: str, link: str = "") -> None:
         """Connect to the view's own socket at ``address``; with a ``link`` through the console that serves there."""
         options: dict[str, Any] = {"subprotocols": [f"viser-v{viser.__version__}"], "max_size": None}
-        options["close_timeout"] = 0.5  # what was not heard keeps a close waiting
+        options["close_timeout"] = 0.5  # what was not heard keeps a close waiting,
+        options["max_queue"] = None  # and would keep pings unanswered
         if link:
             self.socket = connect(f"ws://{urlsplit(link).netloc}{address}", origin=link.partition("/#")[0], **options)
         else:
