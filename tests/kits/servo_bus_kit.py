@@ -6,6 +6,7 @@ import itertools
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -81,9 +82,9 @@ class ServoBusProcess:
         port: Where it is.
     """
 
-    def __init__(self, rig: str = "so101") -> None:
+    def __init__(self, rig: str = "so101", overrides: Sequence[str] = ()) -> None:
         self.rig = rig
-        self.overrides = servo_bus_overrides()
+        self.overrides = [*overrides] or servo_bus_overrides()
         self.port = self.overrides[-1].partition("=")[2]
         options = [word for value in self.overrides for word in ("--set", value)]
         command = [sys.executable, "-m", "hal_emulators.servo_bus", "--config", rig, *options]
