@@ -33,7 +33,6 @@ from hal.drivers.scene.shared import Connection, address_of, check_scene, scene_
 from hal.errors import CommandError, ConnectionLost, ControlTaken, HalError
 from hal.host.process import pack_error
 from hal.specs import RobotSpec, WorldSpec
-from hal_emulators.shared_world import PRIORITY, raise_priority
 
 _LONGEST_GAP = 5.0
 """Time for which the world catches up, s."""
@@ -377,7 +376,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (HalError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=emulator, flush=True)
         return 1
-    raise_priority(PRIORITY - 10)
     print("ready", file=emulator, flush=True)
     server.run(sys.stdin.fileno())
     server.close()
