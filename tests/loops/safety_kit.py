@@ -43,7 +43,7 @@ ELSEWHERE = {
     "that link is cut": (
         f"{SYSTEM}remote.py::test_a_link_that_is_lost_ends_the_program_and_a_new_one_moves_nothing_by_itself",
         f"{SYSTEM}remote.py::test_a_program_that_freezes_or_is_killed",
-        f"{SYSTEM}remote.py::test_a_server_that_is_killed_leaves_nothing_and_the_next_call_says_so",
+        f"{SYSTEM}remote.py::test_a_server_or_its_host_that_is_killed_leaves_nothing_and_the_next_call_says_so",
     ),
     "a computer that has sent nothing over": ("tests/unit/remote/test_link.py::test_a_silent_end_is_gone",),
     "longest round trip of a link": (f"{SYSTEM}remote.py::test_a_link_with_a_long_round_trip_opens_no_session",),
