@@ -1,6 +1,6 @@
 """Curation against LeRobot's own tools: every number and picture is equal.
 
-LeRobot needs an environment of its own (docs/record.md). This file runs only where ``HAL_TEST_LEROBOT`` is that
+LeRobot needs an environment of its own (docs/export.md). This file runs only where ``HAL_TEST_LEROBOT`` is that
 environment's interpreter, and CI has none:
 
     HAL_TEST_LEROBOT=~/lerobot/bin/python pytest tests/system/test_lerobot_tools.py
