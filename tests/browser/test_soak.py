@@ -41,7 +41,7 @@ def hold_and_drive() -> str | None:
         browser.wait_driving()
         wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad at rest")
         browser.hold()
-        wait_for(lambda: bench.status == "following", "the arm to follow")
+        wait_for(lambda: bench.status == "following" or bench.trip != "none", "the arm to follow")
         end, moved, last = time.monotonic() + SECONDS, 0.0, bench.tcp
         keys = ("ArrowLeft", "ArrowRight")
         turn = 0
