@@ -227,7 +227,7 @@ def run_command(table: Mapping[str, Command], target: object, words: Sequence[st
         if len(words) > len(command.usage.split()) and "..." not in command.usage:
             raise ValueError("too many words")
         return dict(command.run(target, list(words[1:])) or {})
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, KeyError) as error:
         raise ValueError(f"{words[0]}: {error}; usage: {command.usage}") from None
 
 

@@ -7,10 +7,10 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from hal_emulators.control import Started, run_emulator
+from hal_emulators.control import Started, help_text, run_emulator
 from hal_emulators.shared_world import enter_world, has_world
 
-from .server import ServoBusEmulator, find_arms, find_leaders, help_text
+from .server import COMMANDS, ServoBusEmulator, find_arms, find_leaders
 
 _WHAT = (
     "Emulates every arm and leader with Feetech or Dynamixel servos of a rig, on a pseudo terminal with the name of "
@@ -20,7 +20,7 @@ _WHAT = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program, and return its exit status."""
-    return run_emulator("servo_bus", _WHAT, help_text(), arguments, _start)
+    return run_emulator("servo_bus", _WHAT, help_text(COMMANDS), arguments, _start)
 
 
 def _start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Started:

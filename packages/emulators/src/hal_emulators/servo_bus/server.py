@@ -10,25 +10,24 @@ import contextlib
 import os
 import random
 import select
-import signal
 import termios
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 
 from hal.config.loader import load
 from hal.drivers.servo_bus.protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer
 from hal.specs import RobotSpec
-from hal_emulators.control import read_end, read_switch
+from hal_emulators.control import Command, assign, make_commands, read_end, read_switch, run_command
 from hal_emulators.shared_world import PRIORITY, load_real, raise_priority
 from hal_emulators.terminal import PseudoTerminal
 
 from .arm import EmulatedArm
 from .servo import ALERT, SERVOS, DynamixelServo, Servo
 
-__all__ = ["ServoBusEmulator", "find_arms", "find_leaders", "help_text"]
+__all__ = ["COMMANDS", "ServoBusEmulator", "find_arms", "find_leaders"]
 
 _STEP = 0.002
 """Step of the mechanics, s."""
@@ -236,14 +235,8 @@ class ServoBusEmulator:
         """
         words = line.split()
         name = words.pop(0) if words and words[0] in self.lines else next(iter(self.lines))
-        command = COMMANDS.get(words[0] if words else "")
-        if command is None:
-            raise ValueError(f"there is no command {' '.join(words[:1])!r}; help lists them")
-        try:
-            with self.lock:
-                return command.run(self.lines[name], words[1:]) or {}
-        except (ValueError, IndexError, KeyError) as error:
-            raise ValueError(f"{error}; usage: {command.usage}") from None
+        with self.lock:
+            return run_command(COMMANDS, self.lines[name], words)
 
     def __enter__(self) -> ServoBusEmulator:
         for line in self.lines.values():
@@ -259,16 +252,6 @@ class ServoBusEmulator:
 
 
 # Commands.
-
-
-class _Command(NamedTuple):
-    usage: str
-    meaning: str
-    run: Callable[[ServoLine, list[str]], dict[str, Any] | None]
-
-
-def _set(name: str, read: Callable[[str], Any]) -> Callable[[ServoLine, list[str]], None]:
-    return lambda line, words: setattr(line, name, read(words[0]))
 
 
 def _lose(line: ServoLine, words: list[str]) -> None:
@@ -348,40 +331,30 @@ def _reset(line: ServoLine, _: list[str]) -> None:
         servo.error, servo.voltage, servo.temperature = 0, 121, 31
 
 
-COMMANDS = {
-    "lose": _Command("lose P | next N [ID]", "lose that share of the answers, or exactly the next N", _lose),
-    "late": _Command("late S", "send answers S seconds late", _set("delay", float)),
-    "double": _Command("double on|off", "send each answer twice", _set("copies", lambda word: 1 + read_switch(word))),
-    "spoil": _Command("spoil N", "spoil the checksum of the next N answers", _set("spoil_next", int)),
-    "silent": _Command("silent ID|all S|on|off", "neither hear nor answer", _silence),
-    "unplug": _Command("unplug S|on|off", "take the line away", _set("out_until", read_end)),
-    "power": _Command("power [S|on|off]", "a brown-out: silent for 0.05 s or S, then without torque", _power),
-    "twin": _Command("twin ID on|off", "two motors have this id", _twin),
-    "baud": _Command("baud N", "let the motors listen at this rate only", _baud),
-    "error": _Command(
+COMMANDS = make_commands(
+    Command("lose P | next N [ID]", "lose that share of the answers, or exactly the next N", _lose),
+    Command("late S", "send answers S seconds late", assign("delay", float)),
+    Command("double on|off", "send each answer twice", assign("copies", lambda word: 1 + read_switch(word))),
+    Command("spoil N", "spoil the checksum of the next N answers", assign("spoil_next", int)),
+    Command("silent ID|all S|on|off", "neither hear nor answer", _silence),
+    Command("unplug S|on|off", "take the line away", assign("out_until", read_end)),
+    Command("power [S|on|off]", "a brown-out: silent for 0.05 s or S, then without torque", _power),
+    Command("twin ID on|off", "two motors have this id", _twin),
+    Command("baud N", "let the motors listen at this rate only", _baud),
+    Command(
         "error ID|all BITS",
         "raise errors: 1 voltage, 4 heat, 32 overload; Feetech: 2 sensor, 8 current; Dynamixel: 8 sensor, 16 shock",
         _set_servos("error"),
     ),
-    "voltage": _Command("voltage ID|all V", "change the supply", _set_servos("voltage", 10.0)),
-    "temperature": _Command("temperature ID|all C", "change what a motor reports, deg C", _set_servos("temperature")),
-    "register": _Command("register ID ADDRESS VALUE", "change a register, whatever its size", _register),
-    "turn": _Command("turn ID N", "let a Dynamixel motor count N turns more", _turn),
-    "plug": _Command("plug all|N ...", "only these motors are on the bus, counted from the base", _plug),
-    "place": _Command("place [Q ...]", "switch off, and hold the arm there until its torque is on", _place),
-    "hand": _Command(
-        "hand S Q ... [LEVER]", "a hand moves a leader there in S seconds, after its other motions", _lead
-    ),
-    "push": _Command("push JOINT NM", "push a joint with this torque, until 0", _push),
-    "object": _Command("object M|none", "put an object of this width into the jaw", _put),
-    "state": _Command("state", "motion, goals, torque, errors", lambda line, _: line.arm.report()),
-    "reset": _Command("reset", "end all faults of frames and motors", _reset),
-    "kill": _Command("kill", "end this program at once", lambda _, __: os.kill(os.getpid(), signal.SIGKILL)),
-    "help": _Command("help", "this table", lambda _, __: {"text": help_text()}),
-}
-
-
-def help_text() -> str:
-    """Return the table of commands."""
-    width = max(len(command.usage) for command in COMMANDS.values())
-    return "\n".join(f"  {command.usage:{width}}  {command.meaning}" for command in COMMANDS.values())
+    Command("voltage ID|all V", "change the supply", _set_servos("voltage", 10.0)),
+    Command("temperature ID|all C", "change what a motor reports, deg C", _set_servos("temperature")),
+    Command("register ID ADDRESS VALUE", "change a register, whatever its size", _register),
+    Command("turn ID N", "let a Dynamixel motor count N turns more", _turn),
+    Command("plug all|N ...", "only these motors are on the bus, counted from the base", _plug),
+    Command("place [Q ...]", "switch off, and hold the arm there until its torque is on", _place),
+    Command("hand S Q ... [LEVER]", "a hand moves a leader there in S seconds, after its other motions", _lead),
+    Command("push JOINT NM", "push a joint with this torque, until 0", _push),
+    Command("object M|none", "put an object of this width into the jaw", _put),
+    Command("state", "motion, goals, torque, errors", lambda line, _: line.arm.report()),
+    Command("reset", "end all faults of frames and motors", _reset),
+)
