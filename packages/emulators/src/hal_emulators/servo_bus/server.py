@@ -211,17 +211,20 @@ class ServoBusEmulator:
     def _serve(self) -> None:
         if self._realtime:
             raise_priority(PRIORITY)  # a busy computer must not look like a silent motor
-        before = monotonic()
+        done = monotonic()
+        """Time up to which the arms have moved."""
         while not self.read_end.is_set():
             with self.lock:
                 now = monotonic()
-                if self._paced and now - before >= _STEP:
-                    self._advance(now - before)
-                    before += max(_STEP * round((now - before) / _STEP), now - before - _LONGEST_GAP)
+                done = max(done, now - _LONGEST_GAP)
+                if self._paced and now - done >= _STEP:  # one step at a time: who asks meanwhile is answered
+                    self._advance(_STEP)
+                    done += _STEP
                 for line in self.lines.values():
                     line.send_due(now)
                 lines = {one: line for line in self.lines.values() for one in line.terminal.descriptors}
-            ready, _, _ = select.select(list(lines), [], [], _STEP / 2)
+            behind = self._paced and now - done >= _STEP
+            ready, _, _ = select.select(list(lines), [], [], _STEP / 20 if behind else _STEP / 2)
             with self.lock:
                 for descriptor in ready:
                     if descriptor in lines[descriptor].terminal.descriptors:  # no command took it away meanwhile
