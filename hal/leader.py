@@ -61,6 +61,8 @@ class LeaderDriver(GamepadDriver):
         self._due = self._retry_at = -math.inf
         """When the next reading is due, by the monotonic clock, and an attempt to connect, by the rig's; s."""
         self._trouble = "it is not open"
+        self.limp = ""
+        """Why it can neither follow nor push the hand although it may, with the remedy; set by :meth:`read_angles`."""
         self._reading = _AWAY
         self._pressed = Threshold()
         self._rested: Sequence[float] = ()
@@ -186,7 +188,9 @@ class LeaderDriver(GamepadDriver):
     def describe(self) -> str:
         """Return what it is and where, or why it is not there."""
         where = f"{self.leader.title} at {self.spec.options.get('port', 'no port')}"
-        return f"no {where}: {self._trouble}" if self._trouble else where
+        if self._trouble:
+            return f"no {where}: {self._trouble}"
+        return f"{where}, without torque: {self.limp}" if self.limp else where
 
     def close(self) -> None:
         """Release the leader."""

@@ -96,12 +96,23 @@ class ServoLeader(LeaderDriver):
                 text = f"{', '.join(holding)} has torque: this may be a follower; if not, switch its supply off and on"
                 raise ConnectionLost(text, code="has_torque")
             angles = [COUNT * (s.position - zero) for s, zero in zip(states, self._zeros, strict=False)]
+            self.limp = self._find_limp(states)
             self._drive(states, self.find_joints(angles), now)
         except BaseException:
             self._disconnect()
             raise
         t = min(state.t for state in states)
         return Angles(t, angles, 0.0 if self.settings.lever is None else self._pulled(COUNT * states[-1].position))
+
+    def _find_limp(self, states: Sequence[MotorState]) -> str:
+        """Return why its motors get no torque although they may: their goals must be where they are."""
+        if not (self.leader.follow or self.leader.feedback):
+            return ""
+        places = [state.position for state in states[: len(self.settings.ids)]]
+        away = zip(self.chain.labels, places, self._clip(places), strict=False)
+        names = [label for label, place, nearest in away if abs(nearest - place) >= _MOVED]
+        advice = "move it inside by hand, or calibrate it"
+        return f"{', '.join(names)} is outside of its calibrated range; {advice}" if names else ""
 
     def _find_ends(self) -> None:
         """Note zeros and the ends of the lever. Raises ConnectionLost if the lever is not calibrated."""

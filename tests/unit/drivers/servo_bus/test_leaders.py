@@ -25,6 +25,7 @@ from hal.drivers.servo_bus.leader import ServoLeader
 from hal.errors import ConfigError
 from hal.leader import Leader
 from hal.lock import DeviceLock
+from hal.preflight import preflight
 from hal_emulators.servo_bus.server import ServoBusEmulator, find_arms, find_leaders
 
 Q = [0.3, -0.4, 0.5, 0.2, -1.0]
@@ -190,6 +191,21 @@ def test_a_leader_is_let_go_when_it_is_closed_and_when_a_motor_is_silent(followe
     assert follower.run(60, AWAY, lambda: all(follower.on()[:-1]))
     follower.leader.close()
     assert not any(follower.on())
+
+
+def test_a_leader_that_gets_no_torque_says_which_joint_is_outside_of_its_range(follower: Follower) -> None:
+    """A motor of one turn takes no goal there, so that it would leap to the end of its range."""
+    follower.far.execute("register 2 9 2047")  # its range now begins above where it is
+    assert not follower.run(30, AWAY, lambda: any(follower.on()))
+    assert "without torque: shoulder_lift (motor 2) is outside" in follower.leader.describe()
+    follower.leader.close()
+    entry = {"model": "so101_leader", "port": follower.far.arm.port, "follow": 0.3, "lever": "deadman"}
+    (result,) = preflight(load({"leaders": {"lead": entry}}).resolve(), 0.05, machine=False)
+    assert (result.level, "shoulder_lift" in result.found, "by hand" in result.remedy) == ("warn", True, True)
+    follower.leader.open()
+    follower.far.execute(f"hand 0.1 0 0.1 {' '.join(map(str, Q[2:]))}")
+    assert follower.run(60, AWAY, lambda: all(follower.on()[:-1])), "inside"
+    assert "torque" not in follower.leader.describe()
 
 
 def test_a_leader_that_may_not_follow_never_has_torque(far: SteppedServos, follower: Follower) -> None:
