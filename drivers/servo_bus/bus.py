@@ -9,7 +9,8 @@ import os
 import select
 import termios
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -19,10 +20,10 @@ from hal.lock import DeviceLock
 from hal.serial_line import explain, open_line, read_line, set_baud
 
 from .protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer, Block, MotorState, ServoProtocol
-from .settings import ANSWER
+from .settings import ANSWER as _ANSWER
 
-_ANSWER, _OPENING = ANSWER, 0.02
-"""Longest time to wait for answers in a cycle of 100 Hz, and while a device is opened, s."""
+_OPENING = 0.02
+"""Longest time to wait for an answer while a device is opened, s."""
 _PATIENCE = 2.0
 """Longest time to wait for another program to release the port, s."""
 _RETRY = 0.25
@@ -137,15 +138,22 @@ class ServoBus:
             raise ConnectionLost.of("servo bus", self.fault or Fault("closed", "it is not open", "open the rig"))
         return self._line
 
-    def send(self, id: int, instruction: int, data: bytes) -> None:
-        """Send a frame. Raises ConnectionLost."""
-        frame, line = self.protocol.encode(id, instruction, data), self.check()
+    @contextmanager
+    def _use_line(self) -> Iterator[int]:
+        """Give the open line, whose errors end the connection. Raises ConnectionLost."""
+        line = self.check()
         try:
-            if os.write(line, frame) < len(frame):
-                raise BlockingIOError(11, "it takes no more data")
+            yield line
         except OSError as error:
             self._lose(error)
             self.check()
+
+    def send(self, id: int, instruction: int, data: bytes) -> None:
+        """Send a frame. Raises ConnectionLost."""
+        frame = self.protocol.encode(id, instruction, data)
+        with self._use_line() as line:
+            if os.write(line, frame) < len(frame):
+                raise BlockingIOError(11, "it takes no more data")
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write registers of several motors at the same time: bytes of the same length, by id. No one answers."""
@@ -180,14 +188,10 @@ class ServoBus:
         found: dict[int, Answer] = {}
         came, end = b"", monotonic() + limit
         while (left := end - monotonic()) > 0.0:
-            line = self.check()
-            if not select.select([line], [], [], left)[0]:
-                break
-            try:
+            with self._use_line() as line:
+                if not select.select([line], [], [], left)[0]:
+                    break
                 answers, came, spoilt = self.protocol.split(came + read_line(line))
-            except OSError as error:
-                self._lose(error)
-                continue
             self.spoilt += spoilt
             for answer in answers:
                 if answer.id in wanted and answer.id not in found:
@@ -202,13 +206,8 @@ class ServoBus:
 
     def _drain(self) -> None:
         """Drop what has come too late, or twice."""
-        try:
-            answers, _, _ = self.protocol.split(read_line(self.check()))
-        except OSError as error:
-            self._lose(error)
-            self.check()
-        else:
-            self.surplus += len(answers)
+        with self._use_line() as line:
+            self.surplus += len(self.protocol.split(read_line(line))[0])
 
     def read(self, id: int, address: int, size: int) -> bytes | None:
         """Return registers of a motor; None if it does not answer. Raises ConnectionLost."""

@@ -75,7 +75,7 @@ class Dynamixel(ServoProtocol):
     status: ClassVar[Block] = (64, 38)
     torque, watchdog, limit, id_address, baud_address, delay_address, lock = 64, 98, 100, 7, 8, 9, None
     goal: ClassVar[Block] = (116, 4)
-    position: ClassVar[Block] = (132, 4)
+    homing = 1
     free: ClassVar[tuple[int, int]] = (11, MULTI)  # in the mode of one turn it takes an offset of a quarter of it only
     restart = 1.5
     errors: ClassVar[Mapping[int, tuple[str, str, str]]] = {
@@ -130,30 +130,18 @@ class Dynamixel(ServoProtocol):
     def decode_registers(self, data: bytes) -> Registers:
         number, delay, drive, mode, follows, offset = struct.unpack_from("<H 7x BBBB 7x i", data)
         limit, high, low, gain = struct.unpack_from("<H 10x ii 28x H", data, 36)
-        model = MODELS.get(number, ServoModel("", 12.0, 1.0, 60))
+        name, nominal, torque, rpm = MODELS.get(number, ServoModel("", 12.0, 1.0, 60))
         wrong = ""
         if mode not in (SINGLE, MULTI, CURRENT):
             wrong = f"is in the operating mode {mode}, not in one for positions ({SINGLE}, {MULTI} or {CURRENT})"
         elif drive & 0x0A:
             wrong = f"has the drive mode {drive}: it is driven by another motor's cable, or switched on by a goal"
         # The error in counts times the gain over 128 is the duty cycle, of which `full` gives the stall torque.
-        stiffness = model.stall_torque / self.full * max(1, gain) / 128 / COUNT
+        stiffness = torque / self.full * max(1, gain) / 128 / COUNT
         calibration = Calibration(drive & 1, offset, low, high)
-        turns = 1 if mode == SINGLE else 2
-        return Registers(
-            model.name,
-            number,
-            delay,
-            calibration,
-            model.nominal,
-            model.stall_torque,
-            model.rpm * 2.0 * pi / 60.0,
-            stiffness,
-            limit,
-            wrong,
-            turns,
-            follows,
-        )
+        turns, speed = 1 if mode == SINGLE else 2, rpm * 2.0 * pi / 60.0
+        motor = Registers(name, number, delay, calibration, nominal, torque, speed, stiffness, limit, wrong)
+        return motor._replace(turns=turns, follows=follows)
 
     def prepare(self, ids: Sequence[int], goals: Sequence[int], limits: Sequence[int], watch: bool) -> Writes:
         """The watchdog ends its own stop when it is written: only then the motor takes goals."""
@@ -167,12 +155,6 @@ class Dynamixel(ServoProtocol):
     def clear(self, states: Mapping[int, MotorState]) -> list[tuple[int, int, bytes]]:
         """A motor with an error has switched its torque off; only a restart ends it."""
         return [(id, REBOOT, b"") for id, state in states.items() if state.error]
-
-    def decode_position(self, data: bytes) -> int:
-        return int.from_bytes(data, "little", signed=True)
-
-    def find_offset(self, count: int, wanted: int) -> int:
-        return wanted - count
 
     def store_calibration(self, calibration: Calibration) -> list[tuple[int, bytes]]:
         _, offset, low, high = calibration

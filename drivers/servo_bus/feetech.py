@@ -41,22 +41,14 @@ class Feetech(ServoProtocol):
     stored: ClassVar[Block] = (0, 40)
     state: ClassVar[Block] = (40, 31)
     status = watchdog = None
+    homing = -1
     torque, limit, id_address, baud_address, delay_address, lock = 40, 48, 5, 6, 7, 55
     goal: ClassVar[Block] = (42, 2)
-    position: ClassVar[Block] = (56, 2)
     free: ClassVar[tuple[int, int]] = (33, 0)
     restart = 0.1
     errors: ClassVar[Mapping[int, tuple[str, str, str]]] = {
-        1: (
-            "voltage",
-            "has a supply of {0.voltage:.1f} V",
-            "check the supply: 12 V for a 12 V motor, 5 to 7.4 V for others",
-        ),
-        2: (
-            "sensor",
-            "has a faulty angle sensor",
-            "switch the power off and on, with the arm supported; replace the motor",
-        ),
+        1: ("voltage", "has a supply of {0.voltage:.1f} V", "check the supply: 12 V, or 5 to 7.4 V for a 7.4 V motor"),
+        2: ("sensor", "has a faulty angle sensor", "support the arm, switch the power off and on; replace the motor"),
         4: ("too_hot", "has {0.temperature} deg C", "let it cool down; lower its load or its speed"),
         8: ("overcurrent", "draws too much current", "check what the arm touches, and its load"),
         32: ("overload", "is overloaded, and has reduced its torque", "check what the arm touches, and its load"),
@@ -89,37 +81,17 @@ class Feetech(ServoProtocol):
 
     def decode_state(self, now: float, answer: Answer, status: bytes) -> MotorState:
         on, goal, limit, position, velocity, load, voltage, temperature, errors = _STATE.unpack(answer.data)
-        return MotorState(
-            now,
-            answer.error | errors,
-            bool(on),
-            False,
-            signed(goal, 15),
-            limit,
-            signed(position, 15),
-            signed(velocity, 15),
-            signed(load, 10),
-            voltage / 10,
-            temperature,
-        )
+        goal, position, speed, load = signed(goal, 15), signed(position, 15), signed(velocity, 15), signed(load, 10)
+        errors |= answer.error
+        return MotorState(now, errors, bool(on), False, goal, limit, position, speed, load, voltage / 10, temperature)
 
     def decode_registers(self, data: bytes) -> Registers:
         number, low, high, voltage_max, limit, offset = struct.unpack("<3x H 4x HH x B x H 13x H 7x", data)
         nominal = 12.0 if voltage_max > 100 else 7.4  # its greatest voltage tells the two kinds apart
         wrong = "is not set to positions within one turn" if data[33] != 0 or data[18] & 0x10 else ""
-        return Registers(
-            "STS3215" if number == MODEL else "",
-            number,
-            data[7],
-            Calibration(0, signed(offset, 11), low, high),
-            nominal,
-            STALL_TORQUES[nominal],
-            4.7,
-            STIFFNESS * max(1, data[21]),
-            limit,
-            wrong,
-            turns=0,
-        )
+        model, stiffness = "STS3215" if number == MODEL else "", STIFFNESS * max(1, data[21])
+        calibration, torque = Calibration(0, signed(offset, 11), low, high), STALL_TORQUES[nominal]
+        return Registers(model, number, data[7], calibration, nominal, torque, 4.7, stiffness, limit, wrong, turns=0)
 
     def prepare(self, ids: Sequence[int], goals: Sequence[int], limits: Sequence[int], watch: bool) -> Writes:
         values = {
@@ -136,12 +108,6 @@ class Feetech(ServoProtocol):
                 found += [(id, WRITE, struct.pack("<BH", 42, max(0, state.position)))]
                 found += [(id, WRITE, bytes((40, state.on)))]
         return found
-
-    def decode_position(self, data: bytes) -> int:
-        return signed(int.from_bytes(data, "little"), 15)
-
-    def find_offset(self, count: int, wanted: int) -> int:
-        return count - wanted
 
     def store_calibration(self, calibration: Calibration) -> list[tuple[int, bytes]]:
         _, offset, low, high = calibration

@@ -60,7 +60,7 @@ class Calibration(NamedTuple):
     drive_mode: int
     """Whether the motor itself turns backwards."""
     homing_offset: int
-    """Added (Dynamixel) to what the encoder reads, or subtracted (Feetech)."""
+    """See :attr:`ServoProtocol.homing`."""
     range_min: int
     range_max: int
     """Ends of the joint's way, as the motor then reports them."""
@@ -113,7 +113,8 @@ class ServoProtocol(ABC):
     goal: ClassVar[Block]
     watchdog: ClassVar[int | None]
     """Address of the time without a frame after which it stops, 0 for never; None if it has none."""
-    position: ClassVar[Block]
+    homing: ClassVar[int]
+    """1 if the homing offset is added to what the encoder reads, -1 if it is subtracted."""
     id_address: ClassVar[int]
     baud_address: ClassVar[int]
     delay_address: ClassVar[int]
@@ -173,14 +174,6 @@ class ServoProtocol(ABC):
     @abstractmethod
     def clear(self, states: Mapping[int, MotorState]) -> list[tuple[int, int, bytes]]:
         """Return the questions that end the errors of these motors: id, instruction, data."""
-
-    @abstractmethod
-    def decode_position(self, data: bytes) -> int:
-        """Return the count in :attr:`position`."""
-
-    @abstractmethod
-    def find_offset(self, count: int, wanted: int) -> int:
-        """Return the homing offset by which a motor without one counts ``wanted`` where it counts ``count`` now."""
 
     @abstractmethod
     def store_calibration(self, calibration: Calibration) -> list[tuple[int, bytes]]:

@@ -134,7 +134,7 @@ class MotorService:
     def take_middle(self) -> None:
         """Let each motor count from :attr:`middle` where it is now. Raises ConnectionLost."""
         for id, count in self._read().items():
-            self._offsets[id] = self.protocol.find_offset(count, self.middle)
+            self._offsets[id] = self.protocol.homing * (self.middle - count)
             self._write(id, Calibration(0, self._offsets[id], 0, TURN - 1))
         self.seen = {id: (count, count) for id, count in self._read().items()}
 
@@ -185,13 +185,15 @@ class MotorService:
 
     def _read(self) -> dict[int, int]:
         ids = [motor.id for motor in self.motors]
-        answers = self.bus.read_all(self.protocol.position, ids, monotonic() + _SCAN)
-        if len(answers) < len(ids):
-            answers = self.bus.read_all(self.protocol.position, ids, monotonic() + _SCAN)
+        for _ in range(2):
+            answers = self.bus.read_all(self.protocol.state, ids, monotonic() + _SCAN)
+            if len(answers) == len(ids):
+                break
         silent = [motor.name for motor in self.motors if motor.id not in answers]
         if silent:
             raise ConnectionLost(f"no answer from {', '.join(silent)}; check plugs and power supply")
-        return {id: self.protocol.decode_position(answer.data) for id, answer in answers.items()}
+        status = bytes(self.protocol.status[1] if self.protocol.status is not None else 0)
+        return {id: self.protocol.decode_state(0.0, answer, status).position for id, answer in answers.items()}
 
     def _read_calibration(self, id: int) -> Calibration:
         block = self.bus.read(id, *self.protocol.stored)
