@@ -58,6 +58,8 @@ class ServoBus:
         self.states: dict[int, MotorState] = {}
         self._status: dict[int, bytes] = {}
         """The newest :attr:`ServoProtocol.status` of each motor."""
+        self._missing: set[int] = set()
+        """Motors whose last answer was lost."""
         self._turn = 0
         """Number of motors whose status was asked for in turn."""
         self.opened = 0
@@ -241,8 +243,10 @@ class ServoBus:
         end = monotonic() + _ANSWER
         answers = self.read_all(self.protocol.state, self.ids, end)
         self.cycles += 1
-        for id in {*self._status} - {*answers}:  # it may have lost its power
-            del self._status[id]
+        missing = {*self.ids} - {*answers}
+        for id in missing & self._missing:  # it may have lost its power; one answer is lost now and then
+            self._status.pop(id, None)
+        self._missing = missing
         if self.protocol.status is not None and not self._wait:
             new = self.read_all(self.protocol.status, self._choose(answers), end)
             self._status.update((id, answer.data) for id, answer in new.items())
@@ -251,8 +255,12 @@ class ServoBus:
                 self.states[id] = self.protocol.decode_state(now, answer, self._status.get(id, b""))
 
     def _choose(self, answers: Mapping[int, Answer]) -> list[int]:
-        """Return the motors whose status is read now: those that are new or report an error, and two in turn."""
-        urgent = [id for id in self.ids if id not in self._status or (id in answers and answers[id].error)]
+        """Return the motors whose status is read now: two that are new or report an error, and two in turn.
+
+        That of all motors, which are new after two cycles without an answer, would take longer than a cycle waits.
+        """
+        new = [id for id in answers if id not in self._status]
+        urgent = [*new, *(id for id, answer in answers.items() if answer.error)][:2]
         self._turn += 2
         return sorted({*urgent, *(self.ids[k % len(self.ids)] for k in (self._turn, self._turn + 1))})
 

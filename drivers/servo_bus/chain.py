@@ -190,7 +190,7 @@ class Chain:
         if bus is None:
             raise ConnectionLost(f"{self.name} is not open", code="not_open")
         try:
-            for _ in range(4):  # of motors that are new, also where an answer is lost
+            for _ in range(8):  # of motors that are new, also where an answer is lost
                 bus.exchange(self, now)
                 if all(id in bus.states for id in self.ids):
                     break

@@ -10,6 +10,7 @@ from dataclasses import replace
 from math import pi
 from pathlib import Path
 from time import monotonic, sleep
+from unittest.mock import patch
 
 import pytest
 from servo_bus_kit import SteppedServos
@@ -18,6 +19,7 @@ from hal import registry
 from hal.driver import Reading, Setpoint
 from hal.drivers.servo_bus import bus
 from hal.drivers.servo_bus.arm import ServoArm
+from hal.drivers.servo_bus.bus import ServoBus
 from hal.drivers.servo_bus.dynamixel import Dynamixel
 from hal.drivers.servo_bus.feetech import Feetech
 from hal.drivers.servo_bus.preflight import check
@@ -281,6 +283,24 @@ def test_single_bad_answers_are_counted_and_stop_nothing(
     assert counted is None or figures[counted] >= 2
     arm.write(goal)
     assert arm.run(0.2).q == pytest.approx(goal, abs=0.01)
+
+
+@pytest.mark.parametrize(("cycles", "again"), [(1, 2), (2, 4)])
+def test_an_arm_answers_in_time_after_cycles_in_which_no_motor_did(viperx: Arm, cycles: int, again: int) -> None:
+    """On the wire of a real one; the status of all motors at once would take longer than a cycle waits."""
+    viperx.engage()
+    viperx.far.execute(f"lose next {8 * cycles}")
+    with patch.object(bus, "_ANSWER", 0.05):
+        viperx.run(0.02 * cycles)  # late answers pass in each second cycle
+    protocol, took = viperx.driver.protocol, []
+    with patch.object(ServoBus, "read_all", autospec=True, side_effect=ServoBus.read_all) as asked:
+        for _ in range(again):
+            asked.reset_mock()
+            reading = viperx.run()
+            sizes = [len(protocol.encode_answer(1, 0, bytes(c.args[1][1]))) * len(c.args[2]) for c in asked.mock_calls]
+            took.append(10.0 * sum(sizes) / viperx.driver.settings.baud)
+    assert reading.t == viperx.now, "all joints are new again"
+    assert 0.003 < max(took) < 0.007
 
 
 def test_a_silent_motor_is_lost_after_a_tenth_of_a_second_and_comes_back(
