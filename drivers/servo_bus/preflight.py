@@ -41,9 +41,8 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         One result per check.
     """
     arm: ServoArm = registry.load(spec.driver, "robot")(spec)
-    shared = spec.gripper is not None and spec.gripper.driver == spec.driver
     devices: list[ServoArm | ServoGripper] = [arm]
-    if shared and spec.gripper is not None:
+    if spec.gripper is not None and spec.gripper.driver == spec.driver:
         devices.append(registry.load(spec.driver, "gripper")(spec.gripper))
     try:
         for device in devices:
@@ -57,13 +56,10 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         yield _check_answers(arm, max(duration, 0.2))
     except ControlTaken as error:
         yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
-    except ConfigError as error:
-        for problem in error.problems:
-            found, _, remedy = problem.message.partition("; ")
-            yield CheckResult("motors", "fail", found, remedy)
     except HalError as error:
-        found, _, remedy = str(error).partition("; ")
-        yield CheckResult("motors", "fail", found, remedy)
+        for text in [one.message for one in error.problems] if isinstance(error, ConfigError) else [str(error)]:
+            found, _, remedy = text.partition("; ")
+            yield CheckResult("motors", "fail", found, remedy)
     finally:
         for device in devices:
             device.close()
@@ -76,15 +72,13 @@ def _check_motors(chain: Chain, states: Sequence[MotorState]) -> Iterator[CheckR
     found = f"{chain.name}: {kind}; {lowest:.1f} V, {hottest} deg C"
     fault = chain.fault(states)
     weak = [r.nominal for r, s in zip(chain.registers, states, strict=True) if s.voltage < _WEAK * r.nominal]
+    remedy = "let them cool down" if hottest >= _HOT else ""
+    if weak and weak[0] > 10.0:
+        remedy = f"a supply of {weak[0]:g} V: with less, the motors are weaker than the model"
     if fault is not None:
         yield CheckResult("motors", "fail", fault.cause, fault.remedy)
-    elif weak and weak[0] > 10.0:
-        remedy = f"a supply of {weak[0]:g} V: with less, the motors are weaker than the model"
-        yield CheckResult("motors", "warn", found, remedy)
-    elif hottest >= _HOT:
-        yield CheckResult("motors", "warn", found, "let them cool down")
     else:
-        yield CheckResult("motors", "ok", found)
+        yield CheckResult("motors", "warn" if remedy else "ok", found, remedy)
     slow = [chain.motors[id] for id, r in chain.stored.items() if r.return_delay]
     if slow:
         remedy = "set the return delay to 0: hal calibrate arm does"

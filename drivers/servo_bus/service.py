@@ -166,8 +166,9 @@ class MotorService:
             found[motor.name] = Calibration(mode, self._offsets[motor.id], low, high)
         if problems:
             raise ConfigError(problems)
-        self.restore({motor.name: {"id": motor.id, **found[motor.name]._asdict()} for motor in self.motors})
-        return {motor.name: {"id": motor.id, **found[motor.name]._asdict()} for motor in self.motors[::-1]}
+        file = {motor.name: {"id": motor.id, **found[motor.name]._asdict()} for motor in self.motors[::-1]}
+        self.restore(file)
+        return file
 
     def restore(self, file: Mapping[str, Mapping[str, Any]]) -> None:
         """Write LeRobot's file into the motors. Raises ConnectionLost, ValueError for a motor that it lacks."""
