@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import ipaddress
 import json
 import math
@@ -51,6 +52,8 @@ def run_emulator(
     try:
         with contextlib.ExitStack() as stack:
             started = start(options, stack)
+            gc.collect()
+            gc.freeze()  # a collection of all objects takes longer than a driver waits for an arm
             port = CommandPort(started.execute, options.port)
             print(f"ready: {started.places}; control port {port.number}; help lists the commands", flush=True)
             serve_prompt(started.execute)
