@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
 from hal.apps.keys import main
 from hal.keys import LIST, revoke
+
+_CA = """
+[ca]
+default_ca = this
+[this]
+database = {folder}/index
+new_certs_dir = {folder}
+certificate = {folder}/authority.crt
+private_key = {folder}/authority.key
+rand_serial = yes
+unique_subject = no
+default_md = sha256
+copy_extensions = copyall
+policy = names
+[names]
+commonName = supplied
+"""
+"""Of the program openssl, whose other commands count the validity in days."""
 
 
 def make_keys(root: Path, address: str) -> None:
@@ -37,7 +56,7 @@ def make_keys(root: Path, address: str) -> None:
         copy.write_text(file.read_text())
         copy.chmod(0o600)
         if folder.startswith("expired"):
-            _expire(copy, home)
+            end_validity(copy, home, -86400.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HAL_KEYS", str(home))
         known = (home / LIST).read_text()
@@ -45,12 +64,15 @@ def make_keys(root: Path, address: str) -> None:
         (home / LIST).write_text(known)
 
 
-def _expire(file: Path, authority: Path) -> None:
-    """Let a certificate have ended yesterday."""
+def end_validity(file: Path, authority: Path, seconds: float) -> None:
+    """Sign a certificate anew so that it ends in so many seconds, or has ended."""
     asked = ["openssl", "x509", "-x509toreq", "-in", file, "-key", file, "-copy_extensions", "copyall"]
     request = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
-    signed = ["-CA", authority / "authority.crt", "-CAkey", authority / "authority.key", "-set_serial", "7"]
-    command = ["openssl", "x509", "-req", *signed, "-days", "-1", "-copy_extensions", "copyall"]
-    old = subprocess.run(command, input=request, capture_output=True, text=True, check=True).stdout
+    (authority / "index").touch()
+    (authority / "ca.conf").write_text(_CA.format(folder=authority))
+    until = time.strftime("%Y%m%d%H%M%SZ", time.gmtime(time.time() + seconds))
+    dates = ["-startdate", "20200101000000Z", "-enddate", until]
+    command = ["openssl", "ca", "-batch", "-notext", "-config", authority / "ca.conf", "-in", "/dev/stdin", *dates]
+    signed = subprocess.run(command, input=request, capture_output=True, text=True, check=True).stdout
     key, _, rest = file.read_text().partition("-----BEGIN CERTIFICATE-----")
-    file.write_text(key + old + rest[rest.index("-----BEGIN") :])
+    file.write_text(key + signed + rest[rest.index("-----BEGIN") :])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import ssl
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 from errors_kit import raises_code
-from keys_kit import make_keys
+from keys_kit import end_validity, make_keys
 from link_kit import start_server
 
 import hal
@@ -22,6 +23,7 @@ from hal.apps.keys import main
 from hal.errors import ConnectionLost, NotSupported
 from hal.keys import Credentials
 from hal.remote.client import split_address
+from hal.types import RobotStatus
 
 pytestmark = pytest.mark.slow
 ADDRESS = "127.0.0.2"
@@ -72,7 +74,7 @@ def send(to: tuple[str, int], data: bytes, context: ssl.SSLContext | None = None
     return answer
 
 
-def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_is_revoked(
+def test_keys_from_the_command_line_and_certificates_that_are_revoked_and_expire(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make_keys(tmp_path, ADDRESS)
@@ -101,9 +103,9 @@ def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_
         idle = [socket.create_connection(where) for _ in range(STRANGERS)]  # more than may wait; none says anything
 
         become("person")
-        tap = Recorder(where)
+        tap, began = Recorder(where), time.monotonic()
         with hal.open({"robots": {"panda": {"at": tap.at}}}, pad="none") as one:
-            arm = one.robots["panda"]
+            opening, arm = time.monotonic() - began, one.robots["panda"]
             arm.move_to(arm.home + [0.1, 0, 0, 0, 0, 0, 0], speed=0.5)
             moved = arm.state().q[0] - arm.home[0]
             assert moved > 0.09
@@ -115,7 +117,7 @@ def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_
             secured.settimeout(20.0)
             while secured.recv(1 << 16):
                 pass
-            assert (arm.state().q_set == rest).all()
+            assert (arm.state(1.0).q_set == rest).all()
             capsys.readouterr()
             assert check(["--at", at, "--duration", "0.3", "--json"]) == 0, "the link, while somebody drives over it"
             measured = json.loads(capsys.readouterr().out)
@@ -132,15 +134,34 @@ def test_keys_from_the_command_line_to_an_arm_that_moves_and_a_certificate_that_
             with raises_code(ConnectionLost, "certificate_revoked"), arm.control(rate_hz=5) as control:
                 control.send(hal.JointVelocity([0.0] * 7))
                 (tmp_path / "host" / "certificates.txt").write_text(revoke(tmp_path, "anna"))
-                while True:
-                    control.send(hal.JointVelocity([0.0] * 7))
-                    time.sleep(0.01)
+                turn(control)
         with raises_code(ConnectionLost, "certificate_revoked"):
             hal.open(rig, pad="none")
+
+        end_validity(tmp_path / "person" / "person-anna.pem", tmp_path / "home", 2.0 + 2.0 * opening)  # not revoked
+        with raises_code(ConnectionLost, "certificate_expired"), hal.open(rig, pad="none") as other:
+            begun = other.robots["panda"].state(1.0).q_set
+            with other.robots["panda"].control(rate_hz=5) as control:
+                turn(control)
+        with raises_code(ConnectionLost, "certificate_expired"):
+            hal.open(rig, pad="none")
+        become("viewer")
+        with hal.open(rig, pad="none") as watched:
+            state = watched.robots["panda"].state(1.0)
+            assert (state.status, state.dq_set.any()) == (RobotStatus.IDLE, False), "held as between two sessions"
+            assert state.q_set[0] > begun[0] + 0.01, "it moved until then"
         assert server.poll() is None
         del idle
     finally:
         server.kill()
+
+
+def turn(control: hal.Control) -> None:
+    """Let the arm turn for 30 s, or until the link ends."""
+    for _ in range(3000):
+        with contextlib.suppress(hal.MotionStopped):  # by a busy computer
+            control.send(hal.JointVelocity([0.1, 0, 0, 0, 0, 0, 0]))
+        time.sleep(0.01)
 
 
 def revoke(root: Path, name: str) -> str:
