@@ -39,11 +39,13 @@ ELSEWHERE = {
     ),
     "the [link](several-machines.md) to the computer": (
         f"{SYSTEM}remote.py::test_a_link_that_stalls_stops_the_arm_until_it_is_acknowledged",
+        f"{SYSTEM}remote.py::test_a_server_that_freezes_or_is_killed_moves_the_arm_only_after_a_new_press_or_session",
     ),
     "that link is cut": (
         f"{SYSTEM}remote.py::test_a_link_that_is_lost_ends_the_program_and_a_new_one_moves_nothing_by_itself",
         f"{SYSTEM}remote.py::test_a_program_that_freezes_or_is_killed",
-        f"{SYSTEM}remote.py::test_a_server_or_its_host_that_is_killed_leaves_nothing_and_the_next_call_says_so",
+        f"{SYSTEM}keys.py::test_keys_from_the_command_line_and_certificates_that_are_revoked_and_expire",
+        f"{SYSTEM}remote.py::test_a_server_whose_host_is_killed_ends_and_the_next_call_says_so",
     ),
     "a computer that has sent nothing over": ("tests/unit/remote/test_link.py::test_a_silent_end_is_gone",),
     "longest round trip of a link": (f"{SYSTEM}remote.py::test_a_link_with_a_long_round_trip_opens_no_session",),

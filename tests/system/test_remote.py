@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from waiting import wait_until
 
 import hal
 from hal.apps import collect, replay
+from hal.deadman import Deadman
 from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
 from hal.lock import APP_MARK
@@ -183,19 +184,82 @@ def find_hosts(server: int) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize(("victim", "code"), [("server", "link_closed"), ("host", "process_ended")])
-def test_a_server_or_its_host_that_is_killed_leaves_nothing_and_the_next_call_says_so(victim: str, code: str) -> None:
+def test_a_server_whose_host_is_killed_ends_and_the_next_call_says_so() -> None:
     server, at = start_server()
     try:
         with hal.open({"robots": {"panda": {"at": at}}}, pad="none") as rig:
             (host,) = find_hosts(server.pid)
-            os.kill(server.pid if victim == "server" else int(host), signal.SIGKILL)
-            with raises_code(ConnectionLost, code):
+            os.kill(int(host), signal.SIGKILL)
+            with raises_code(ConnectionLost, "process_ended"):
                 while True:
                     rig.robots["panda"].check()
                     time.sleep(0.01)
-            wait_until(lambda: not find_hosts(server.pid), "nothing is left")
             server.wait(20.0)
+    finally:
+        server.kill()
+
+
+def test_a_server_that_freezes_or_is_killed_moves_the_arm_only_after_a_new_press_or_session() -> None:
+    """It freezes for less than the link may be silent, which is a trip, then for longer; then it is killed."""
+    server, at = start_server()
+    deadman, rig_file = Deadman("test"), {"robots": {"panda": {"at": at}}}
+    codes: set[str | None] = set()
+
+    def drive_until(control: hal.Control, condition: Callable[[], bool], held: bool = True) -> None:
+        """Let the arm turn until ``condition``; note the codes of all stops."""
+        for tick in control.robot.clock.rate(100):
+            deadman.update(held, True, time.monotonic())
+            try:
+                control.send(hal.JointVelocity([0.2, 0, 0, 0, 0, 0, 0]))
+            except hal.MotionStopped as stop:
+                codes.add(stop.code)
+            if condition():
+                return
+            assert tick.elapsed < 20.0
+
+    def freeze() -> float:
+        """Stop the server; return when."""
+        server.send_signal(signal.SIGSTOP)
+        return time.monotonic()
+
+    try:
+        deadman.update(False, True, time.monotonic())
+        with contextlib.suppress(ConnectionLost), hal.open(rig_file, pad="none") as rig:
+            arm = rig.robots["panda"]
+            with arm.control(rate_hz=5, deadman=deadman) as control:
+                drive_until(control, lambda: arm._mail.peek().dq_set[0] > 0.15)
+                began = freeze()
+                drive_until(control, lambda: time.monotonic() > began + 2.0 * SILENCE)
+                server.send_signal(signal.SIGCONT)
+                drive_until(control, lambda: control.trip is not Trip.NONE and not any(arm._mail.peek().dq_set))
+                rest, stopped = arm._mail.peek().q_set, arm._mail.peek().t_stop
+                assert stopped - began <= SILENCE + LATE
+                for held in (True, False):
+                    end = time.monotonic() + 0.3
+                    drive_until(control, lambda end=end: time.monotonic() > end, held)
+                    assert arm._mail.peek().q_set == rest, "a dead-man that is still held moves nothing, nor a release"
+                assert codes
+                assert codes <= {"app_silent", "pad_silent"}
+                drive_until(control, lambda: arm._mail.peek().dq_set[0] > 0.15)
+                began = freeze()
+                with pytest.raises(ConnectionLost) as lost:
+                    drive_until(control, lambda: False)
+        assert lost.value.code in ("link_silent", "process_silent")
+        server.send_signal(signal.SIGCONT)
+        with hal.open(rig_file, pad="none") as rig:
+            arm = rig.robots["panda"]
+            state = arm.state()
+            assert arm._mail.peek().t_stop - began <= SILENCE + LATE
+            rig.clock.sleep(0.3)
+            assert arm.state().status is RobotStatus.IDLE
+            assert (arm.state().q_set == state.q_set).all()
+            assert max(rig.statistics()[at]["robots"]["panda"]["peak"].values()) <= 1.0 + 1e-6, "within every limit"
+            deadman.update(False, True, time.monotonic())
+            with raises_code(ConnectionLost, "link_closed"), arm.control(rate_hz=5, deadman=deadman) as control:
+                drive_until(control, lambda: arm._mail.peek().dq_set[0] > 0.15)
+                server.kill()
+                drive_until(control, lambda: False)
+        wait_until(lambda: not find_hosts(server.pid), "nothing is left")
     finally:
         server.kill()
 
@@ -233,11 +297,16 @@ def test_a_program_that_freezes_or_is_killed(bench: Bench, what: str, how: signa
         if how is signal.SIGKILL or what != "the program":  # the link is silent for 2 s, or gone
             wait_until(lambda: not bench.server.served, "free for the next client")
             assert mail.peek().status is RobotStatus.IDLE
+        wait_until(lambda: bench.speed() == 0.0, "at rest")
+        rest = mail.peek().q_set
     finally:
         if how is signal.SIGSTOP:
             os.kill(pid, signal.SIGCONT)
-    if what == "the program" and how is signal.SIGSTOP:
+    if what != "the program":
+        assert program.wait_for("lost") in ("process_ended", "process_silent")
+    elif how is signal.SIGSTOP:
         assert program.wait_for("stopped")
+    assert mail.peek().q_set == rest, "nothing moves by itself"
 
 
 @pytest.mark.parametrize("how", ["closed", "cable"])
