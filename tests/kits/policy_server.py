@@ -1,4 +1,4 @@
-"""A policy's server as a program, for tests that kill or freeze it: the first joint moves at a constant speed.
+"""A policy's server as a program, also to be killed or frozen: the first joint moves at a constant speed.
 
 python policy_server.py LATENCY JITTER: s from a request to its answer, and the greatest difference from that.
 """
@@ -6,8 +6,11 @@ python policy_server.py LATENCY JITTER: s from a request to its answer, and the 
 from __future__ import annotations
 
 import random
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -24,12 +27,26 @@ CONFIG: dict[str, Any] = {
 }
 
 
+@contextmanager
+def serving(latency: float, jitter: float = 0.0) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Run the server; yields its process and its address."""
+    command = [sys.executable, __file__, str(latency), str(jitter)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        try:
+            yield server, server.stdout.readline().strip()
+        finally:
+            server.kill()
+
+
 def main() -> None:
     latency, jitter = map(float, sys.argv[1:])
     chance = random.Random(1)
 
     def infer(request: dict[str, Any]) -> dict[str, Any]:
         time.sleep(latency + jitter * chance.uniform(-1.0, 1.0))
+        if "picture" in request and np.ptp(request["picture"]) < 50:
+            raise ValueError("nothing in the picture")
         speed = SPEED if request["way"] == "left" else -SPEED
         return {"actions": request["state"] + speed * np.arange(STEPS)[:, None] / RATE * np.eye(7)[0]}
 

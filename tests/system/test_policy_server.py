@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
-from policy_server import CONFIG, EXECUTE, RATE, SPEED
+from policy_server import CONFIG, EXECUTE, RATE, SPEED, serving
 
 import hal
 from hal.learning.asynchronous import RemotePolicy
@@ -23,26 +19,12 @@ from hal.learning.remote import PolicyClient
 pytest.importorskip("msgpack")
 pytestmark = pytest.mark.slow
 
-PROGRAM = Path(__file__).resolve().parents[1] / "kits" / "policy_server.py"
-
 
 @pytest.fixture(scope="module")
 def rig() -> Iterator[hal.Rig]:
     overrides = ["cameras={}"]
     with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=overrides) as opened:
         yield opened
-
-
-@contextmanager
-def serving(latency: float, jitter: float = 0.0) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run the server; yields its process and its address."""
-    command = [sys.executable, str(PROGRAM), str(latency), str(jitter)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
-        assert server.stdout is not None
-        try:
-            yield server, server.stdout.readline().strip()
-        finally:
-            server.kill()
 
 
 def drive(

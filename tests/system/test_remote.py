@@ -15,14 +15,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from app_kit import run_here
 from errors_kit import raises_code
 from link_kit import Bench, serve_rig, served_arm, start_server
 from operator_kit import Operator
+from policy_server import CONFIG, SPEED, serving
 from recording_kit import small
 from waiting import wait_until
 
 import hal
-from hal.apps import collect, replay
+from hal.apps import collect, replay, rollout
 from hal.deadman import Deadman
 from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
@@ -67,7 +69,32 @@ def drive(rig: hal.Rig) -> dict[str, Any]:
     return {"moved": moved, "streamed": streamed, "width": arm.gripper.state().width, "stop": stop.value.code}
 
 
-def test_the_same_program_drives_an_arm_of_another_computer() -> None:
+def roll_out(arm_at: str, folder: Path) -> None:
+    """Run ``hal rollout`` with an arm, a camera and a policy of three other computers, as if all were of one."""
+    view = {"model": "realsense_d435", "output": {"width": 160, "height": 120}}
+    view["look_at"] = {"target": [0, 0, 0.7], "distance": 1.5}
+    seen = {"observation": {**CONFIG["observation"], "picture": {"camera": "scene", "size": [120, 160]}}}
+    (folder / "policy.yaml").write_text(json.dumps({**CONFIG, **seen}))
+    cameras, camera_at = start_server("robots={}", f"cameras={json.dumps({'scene': view})}")
+    try:
+        devices = {"robots": {"panda": {"at": arm_at}}, "cameras": {"scene": {"at": camera_at}}}
+        (folder / "rig.yaml").write_text(json.dumps(devices))
+        with serving(0.05, 0.04) as (_, url):
+            words = ["--config", folder / "rig.yaml", "--policy", url, "--policy-config", folder / "policy.yaml"]
+            words += ["--task", "left", "--seconds", 1.5, "--rate", 50, "--report", folder / "report.json"]
+            done = run_here(rollout.main, *words, "--out", folder / "runs")
+    finally:
+        cameras.kill()
+    assert done.returncode == 0, done.stdout + done.stderr
+    (outcome,) = json.loads((folder / "report.json").read_text())["episodes"]
+    assert (outcome["ended"], outcome["code"]) == ("time", "")
+    (episode,) = Dataset(folder / "runs").episodes
+    q = episode.columns["observation.state"][:, 0]
+    assert 0.1 < q[-1] - q[0] < 1.2 * SPEED * 1.5
+    assert [np.ptp(frame) > 50 for frame in episode.frames("scene")] == [True] * episode.length
+
+
+def test_the_same_programs_drive_an_arm_of_another_computer(tmp_path: Path) -> None:
     """``hal serve --sim`` as a program; set-points at rest are the same as on one computer."""
     server, at = start_server()
     try:
@@ -83,6 +110,7 @@ def test_the_same_program_drives_an_arm_of_another_computer() -> None:
         assert np.abs(there["streamed"] - here["streamed"]).max() < 1e-9
         assert there["stop"] == here["stop"] == Trip.STOP.code
         assert abs(there["width"] - here["width"]) < 1e-3
+        roll_out(at, tmp_path)
         server.send_signal(signal.SIGINT)
         assert server.wait(20.0) == 130
     finally:
