@@ -102,6 +102,8 @@ def grasp_cube(config: Path, sim: bool) -> tuple[bool, float, float]:
         assert found is not None
         low = rig.world.pose("cube").position[2]
         done = grasp(arm, grasp_pose(found, arm.gripper), unattended=True)
+        if done:  # the emulators' world may be late
+            wait_until(lambda: rig.world.pose("cube").position[2] - low > 0.095, "the cube is lifted")
         return bool(done), done.width, rig.world.pose("cube").position[2] - low
 
 

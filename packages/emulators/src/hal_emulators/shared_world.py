@@ -75,10 +75,8 @@ class ArmInWorld:
 
     def exchange(self, dt: float, q: Sequence[float]) -> None:
         """Report the joint positions (n,), rad, after a cycle of ``dt`` s, and take what the world says."""
-        if self._connection is None:
-            return
         self._t += dt
-        if self._t < self._due:
+        if self._connection is None or self._t < self._due:
             return
         before, self._q = self._q, [float(x) for x in q]
         if all(abs(a - b) < _AT_REST for a, b in zip(self._q, before, strict=False)):
@@ -165,7 +163,6 @@ def enter_world(
     Raises ConfigError, and ConnectionLost and ValueError if its world does not start, or has no such arm.
     """
     stack.enter_context(run_world(config, overrides))
-    raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
     world = ArmInWorld(address_of(arm), arm.name, role)
     stack.callback(world.close)
     return world

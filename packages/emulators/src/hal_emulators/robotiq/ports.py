@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import random
 import re
@@ -23,6 +24,8 @@ class Port:
 
     def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:
         self.gripper = gripper
+        self.t = self.asked = -math.inf
+        """Time up to which its fingers have moved, and that of the newest request, s; for one in a simulated world."""
         self.silent_until = self.out_until = self.delay = self.lost_share = 0.0
         self.lose_next = self.garble_next = 0
         self._random = random.Random(seed)
@@ -57,7 +60,10 @@ class Port:
         now = monotonic()
         if now < self.silent_until or not self.gripper.powered:
             return True
+        before = self.gripper.request
         self._came[descriptor], answer = self.answer(self._came.get(descriptor, b"") + came)
+        if self.gripper.request != before:
+            self.asked = now
         if self.lose_next or self._random.random() < self.lost_share:
             self.lose_next = max(0, self.lose_next - 1)
         elif answer:

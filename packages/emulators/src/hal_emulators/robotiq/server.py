@@ -36,6 +36,15 @@ def find_grippers(config: str | Path | Mapping[str, Any], overrides: Sequence[st
     return found
 
 
+def _advance_in(world: ArmInWorld, port: Port) -> None:
+    """Move the fingers up to the time that the world has reached, where its arm has come to the object as well."""
+    port.gripper.meet(world.object_width)
+    t = max(port.t, world.now_of_fingers)
+    port.gripper.advance(min(max(0.0, t - max(port.t, port.asked)), _LONGEST_GAP))
+    port.t = t
+    world.fingers = (t, port.gripper.width, port.gripper.force)
+
+
 class RobotiqEmulator:
     """Emulated grippers, each on its line, by the name of the arm.
 
@@ -68,12 +77,11 @@ class RobotiqEmulator:
             left -= dt
             for name, port in self.ports.items():
                 world = self.worlds.get(name)
-                if world is not None:
-                    port.gripper.meet(world.object_width)
-                port.gripper.advance(dt)
-                if world is not None:
-                    world.fingers = (world.now, port.gripper.width, port.gripper.force)
+                if world is None:
+                    port.gripper.advance(dt)
+                else:
                     world.exchange(dt, ())
+                    _advance_in(world, port)
 
     def _serve(self) -> None:
         if self._realtime:
