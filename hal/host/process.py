@@ -156,7 +156,8 @@ class Channel:
         data = json.dumps(message).encode() + b"\n"
         try:
             with self._sending:
-                self._out.settimeout(0.0)
+                if self._out.gettimeout() != 0.0:
+                    self._out.settimeout(0.0)
                 sent = self._out.send(data)
                 if sent < len(data):  # the other side must not see half a message
                     self._out.settimeout(REQUEST_TIMEOUT)
@@ -171,6 +172,13 @@ class Channel:
         """Return a message if there is one; never waits. Raises ChannelClosed if the other process is gone."""
         return self._receive_line(0.0)
 
+    def poll_all(self) -> list[Any]:
+        """Return all messages that have come; never waits. Raises ChannelClosed like :meth:`poll`."""
+        messages = [self._receive_line(0.0)]
+        while b"\n" in self._pending:
+            messages.append(self._receive_line(0.0))
+        return messages
+
     def receive(self, timeout: float) -> Any | None:
         """Return the next message; None if none came within ``timeout`` s. Raises ChannelClosed like :meth:`poll`."""
         deadline = time.monotonic() + timeout
@@ -182,8 +190,9 @@ class Channel:
     def _receive_line(self, timeout: float) -> Any | None:
         if b"\n" not in self._pending:
             try:
-                self.sock.settimeout(timeout)
-                data = self.sock.recv(1 << 20)
+                if timeout != self.sock.gettimeout():  # which costs a call of the system
+                    self.sock.settimeout(timeout)
+                data = self.sock.recv(1 << 16)
             except (BlockingIOError, TimeoutError):
                 return None
             except OSError as error:

@@ -12,6 +12,9 @@ from ..host.memory import Mailbox
 from ..host.records import GripperAct, GripperMail, GroupMemory, RobotMail
 
 _DOUBLE = struct.Struct("<d")
+_INT = struct.Struct("<i")
+ITEM = struct.Struct("<QI")
+"""Number and length of a record in a frame."""
 
 
 def _time(record: bytearray, place: int) -> float:
@@ -39,10 +42,11 @@ class Box:
         self._check = check
         self._taken = 0
         """Number, at the other end, of the record that was written last."""
+        self._packed: tuple[int, tuple[bytes, bytes]] | None = None
 
     def number(self) -> int:
         """Return a number that grows with each record; 0 before the first."""
-        return sum(mailbox.seq() for mailbox in self._mailboxes)
+        return sum(map(Mailbox.seq, self._mailboxes))
 
     def read(self) -> bytes:
         """Return the newest record; empty before the first."""
@@ -50,6 +54,13 @@ class Box:
         if len(found) < len(self._mailboxes):
             return b""
         return found[0] if len(found) == 1 else min(found, key=lambda record: float(_DOUBLE.unpack_from(record)[0]))
+
+    def pack(self, number: int) -> tuple[bytes, bytes]:
+        """Return the parts of a frame that have the newest record, whose :meth:`number` was this, or a newer one."""
+        if self._packed is None or number != self._packed[0] or not self._mailboxes:
+            record = self.read()
+            self._packed = number, (ITEM.pack(number, len(record)), record)
+        return self._packed[1]
 
     def take(self, number: int, record: bytes, shift: float, now: float) -> None:
         """Write a record that has come, unless it is the same as before.
@@ -96,7 +107,7 @@ class CommandBox(Box):
     def read(self) -> bytes:
         """Return the newest command, with its chunk."""
         record = super().read()
-        if record and self._kind(record) is Kind.JOINT_CHUNK:
+        if record and self._kind(record) == Kind.JOINT_CHUNK:
             chunk = self._mail.read_chunk()  # after the record: it is as new, or newer
             if chunk is not None:
                 number, values = chunk
@@ -104,15 +115,15 @@ class CommandBox(Box):
         return record
 
     @classmethod
-    def _kind(cls, record: bytes | bytearray) -> Kind:
-        return Kind(struct.unpack_from("<i", record, cls._KIND)[0])
+    def _kind(cls, record: bytes | bytearray) -> int:
+        return int(_INT.unpack_from(record, cls._KIND)[0])
 
     def _write(self, record: bytearray, shift: float, now: float) -> None:
         size = self._mailboxes[0].record_size
         record, rest = record[:size], record[size:]
         if len(record) < size:
             raise ValueError(f"a command of {len(record)} bytes in place of {size}")
-        chunk = self._kind(record) is Kind.JOINT_CHUNK
+        chunk = Kind(self._kind(record)) is Kind.JOINT_CHUNK
         if not chunk and struct.unpack_from("<H", record, self._COUNT)[0] > max(2 * self._mail.n, 7):
             raise ValueError("a command with too many numbers")
         if chunk and rest:

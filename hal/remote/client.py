@@ -140,9 +140,8 @@ class LinkClient:
     def _copy(self) -> None:
         link, channel = self._link, self._channel
         while os.getppid() == self._parent and time.monotonic() < self._ended_by:
-            link.wait(PERIOD, channel.sock)
-            request = channel.poll()
-            if request is not None:
+            news = channel.poll_all() if link.wait(PERIOD, channel.sock) else ()
+            for request in filter(None, news):  # a new command comes with a message of nothing
                 link.post(request)
                 if request["method"] == "close":
                     self._ended_by = time.monotonic() + CLOSE_LIMIT

@@ -17,7 +17,7 @@ from typing import Any
 from ..errors import ConnectionLost
 from ..histogram import Histogram
 from ..host.records import LAYOUT
-from .boxes import Box
+from .boxes import ITEM, Box
 
 PORT = 7447
 GONE = 2.0
@@ -40,11 +40,11 @@ _BUFFERED = 1 << 16
 """Bytes that the system may hold for a connection: more would only get old there."""
 _UNSENT = 1024
 """Of these, bytes that may wait to be sent the first time: while a slow link holds frames back, none gets old here."""
+_RECORD = 1 << 14
+"""Size of the largest record of TLS, bytes. A read of less has taken all that had come."""
 _HEADER = struct.Struct("<IQddd")
 """Length of the rest, number, time of sending; when the other end's newest frame was sent, and when it came."""
 _COUNT = struct.Struct("<H")
-_ITEM = struct.Struct("<QI")
-"""Number and length of a record."""
 
 
 def describe_version() -> dict[str, Any]:
@@ -152,6 +152,8 @@ class RigLink:
         """Messages that came together with the one that was awaited."""
         self._unsent = memoryview(b"")
         self._buffer = bytearray()
+        self._idle = False
+        """Whether :meth:`wait` has found nothing to read."""
         self._sent: list[int] = []
         """Numbers of the records that were sent last."""
         self._t_sent = -math.inf
@@ -172,11 +174,11 @@ class RigLink:
         """Send a message (JSON) with the next frame. It arrives after all records that are newer than it."""
         self._messages.append(message)
 
-    def wait(self, timeout: float, *others: Any) -> None:
-        """Wait until something comes, here or from one of the ``others``; at most ``timeout`` s."""
-        if isinstance(self._sock, ssl.SSLSocket) and self._sock.pending():
-            return
-        select.select([self._sock, *others], [self._sock] if self._unsent else [], [], timeout)
+    def wait(self, timeout: float, *others: Any) -> bool:
+        """Wait until something comes, at most ``timeout`` s; return whether it came from one of the ``others``."""
+        ready = select.select([self._sock, *others], [self._sock] if self._unsent else [], [], timeout)[0]
+        self._idle = self._sock not in ready
+        return len(ready) > (not self._idle)
 
     # Receiving.
 
@@ -213,15 +215,20 @@ class RigLink:
         return messages
 
     def _read(self) -> None:
+        if self._idle:
+            self._idle = False
+            return
         try:
             before = len(self._buffer)
             while len(self._buffer) < self.largest:
-                data = self._sock.recv(1 << 18)
+                data = self._sock.recv(1 << 16)  # more would be memory that the system maps each time
                 if not data and len(self._buffer) > before:
                     return  # what came last is taken first: it may say why
                 if not data:
                     raise ConnectionLost(f"{self.at} closed the connection", code="link_closed")
                 self._buffer += data
+                if len(data) < _RECORD:
+                    return
         except (BlockingIOError, ssl.SSLWantReadError):
             pass
         except OSError as error:
@@ -251,8 +258,8 @@ class RigLink:
         """Return the records of a frame, each with its number, and its message; empty if there is none."""
         records, offset = [], _COUNT.size
         for _ in range(_COUNT.unpack_from(body)[0]):
-            number, length = _ITEM.unpack_from(body, offset)
-            offset += _ITEM.size
+            number, length = ITEM.unpack_from(body, offset)
+            offset += ITEM.size
             records.append((number, body[offset : offset + length]))
             offset += length
         return records, body[offset:]
@@ -268,14 +275,13 @@ class RigLink:
         now = time.monotonic()
         if self._flush() or (now - self._t_sent < self._period and not self._messages):
             return
-        numbers = [box.number() for box in self.outgoing]
-        if not self._messages and numbers == self._sent and now - self._t_sent < _IDLE:
-            return
         message = json.dumps(self._messages.popleft()).encode() if self._messages else b""
-        parts = [_COUNT.pack(len(self.outgoing))]  # the records are read after the message: they are as new
+        numbers = [box.number() for box in self.outgoing]  # after the message: the records are as new
+        if not message and numbers == self._sent and now - self._t_sent < _IDLE:
+            return
+        parts = [_COUNT.pack(len(numbers))]
         for box, number in zip(self.outgoing, numbers, strict=True):
-            record = box.read()
-            parts += (_ITEM.pack(number, len(record)), record)
+            parts += box.pack(number)
         parts.append(message)
         self.frames += 1
         self._timed = numbers != self._sent

@@ -150,7 +150,9 @@ def test_a_busy_receiver_loses_only_messages_that_may_be_lost() -> None:
     assert 0 < sent < 5000
     assert [receiver.receive(1.0)["frame"] for _ in range(sent)] == list(range(sent))
     assert receiver.poll() is None
-    assert sender.send_if_free({"frame": 0})
+    for message in (None, {"frame": 0}):
+        assert sender.send_if_free(message)
+    assert receiver.poll_all() == [None, {"frame": 0}]
     receiver.close()
     with pytest.raises(ConnectionLost):
         sender.send_if_free({"frame": 0})

@@ -15,6 +15,7 @@ from errors_kit import raises_code
 
 from hal.errors import ConnectionLost
 from hal.geometry import Pose
+from hal.remote.boxes import ITEM
 from hal.remote.frames import LARGEST, ReceivedFrames, SentFrames, decode_frame, encode_frame
 from hal.remote.link import RigLink
 from hal.specs import CameraSpec, DepthSensorSpec
@@ -126,7 +127,8 @@ HEAD = [0.0, 1, None, None]
 )
 def test_a_frame_that_makes_no_sense_ends_the_link(data: bytes) -> None:
     ends = Ends(camera())
-    ends.here.outgoing = [SimpleNamespace(number=lambda: 1, read=lambda: data)]  # type: ignore[list-item]
+    nonsense = SimpleNamespace(number=lambda: 1, pack=lambda number: (ITEM.pack(number, len(data)), data))
+    ends.here.outgoing = [nonsense]  # type: ignore[list-item]
     ends.here.send()
     with raises_code(ConnectionLost, "bad_frame"):
         while ends.frames.frame is None:
