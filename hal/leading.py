@@ -99,6 +99,15 @@ class HandTeleop(Teleop):
     def _make_anchor(self, where: tuple[float, ...], state: RobotState) -> _Anchor:
         return _PoseAnchor(self.robot, _hand_pose, self.speed, np.array(where), state.tcp_set)
 
+    def help(self, pad: Gamepad) -> list[str]:
+        """Return what the controls of ``pad`` do, in lines of text."""
+        hand, name = pad.driver.spec.hand, pad.control_name
+        if not hand:
+            return super().help(pad)
+        lines = [f"hold {name(self.mapping.deadman)} to move as the {hand} hand moves; release it to stop"]
+        gripper = self.mapping.gripper
+        return [*lines, f"gripper: {name('r2')}"] if gripper is not None and "r2" in gripper.controls else lines
+
 
 class LeaderTeleop(HandTeleop):
     """Turns the states of a leader into commands.

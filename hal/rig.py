@@ -498,9 +498,9 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
     _check_leaders(plan, pads)
-    pages = [chosen for chosen in pads if chosen.input == "console"]
+    pages = [chosen for chosen in pads if chosen.input == "console" and not chosen.spec.hand]
     for chosen in pages[1:]:
-        note = "the page is one pad, and drives one arm at a time; for the other one, plug in a gamepad"
+        note = "the page is one pad, and drives one arm at a time; for the other, plug in a gamepad, or use a headset"
         pads[pads.index(chosen)] = chosen._replace(notes=(*chosen.notes, f"{chosen.spec.name}: {note}"))
     wrong = [
         Problem("--pad", "", message, code)

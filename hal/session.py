@@ -503,7 +503,8 @@ class TeleopSession:
         console = self.rig.console
         if console is not None:
             page = registry.pad_driver("console")
-            arm = next((arm for arm in self.arms if arm.pad.driver.spec.driver == page), self.arms[0])
+            specs = [(arm, arm.pad.driver.spec) for arm in self.arms]
+            arm = next((arm for arm, spec in specs if spec.driver == page and not spec.hand), self.arms[0])
             teleop, several = arm.teleop, ("other_arm",) if len(arm.robots) > 1 else ()
             console.explain(teleop.labels(actions=("home", *several, *self._actions)))
             console.show_driving(

@@ -409,6 +409,11 @@ class PadSpec:
         """Kind of its driver: ``gamepad`` or ``leader``."""
         return "gamepad" if self.leader is None else "leader"
 
+    @property
+    def hand(self) -> str:
+        """Hand of a headset whose controller it is, ``left`` or ``right``; empty for any other pad."""
+        return str(self.options.get("hand", ""))
+
 
 @dataclass(frozen=True)
 class GroupSpec:

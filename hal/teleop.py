@@ -529,14 +529,10 @@ def share_pads(robots: Sequence[Robot], pads: Sequence[Gamepad]) -> list[tuple[G
 
 
 def _drop_shared(pads: Sequence[Gamepad]) -> list[Gamepad]:
-    """Leave out further pads whose input is that of one before: the page, or the keys. One thumb, one dead-man."""
-    found: list[Gamepad] = []
-    inputs: set[str] = set()
+    """Leave out further pads whose input is that of one before: the page, a hand, or the keys."""
+    found: dict[object, Gamepad] = {}
     for pad in pads:
-        source = registry.driver(pad.driver.spec.driver).pad_input
-        if source in ("console", "keys"):
-            if source in inputs:
-                continue
-            inputs.add(source)
-        found.append(pad)
-    return found
+        spec = pad.driver.spec
+        source = registry.driver(spec.driver).pad_input
+        found.setdefault((source, spec.hand) if source in ("console", "keys") else spec.name, pad)
+    return list(found.values())

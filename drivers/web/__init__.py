@@ -9,6 +9,7 @@ DRIVER = DriverSpec(
     gamepad="hal.drivers.web.pad:WebPad",
     pad_input="console",
     pad_title="the console",
+    checks={"gamepad": "hal.drivers.web.pad:check_hand"},
     console="hal.drivers.web.console:WebConsole",
     requires={"aiohttp": "pip install aiohttp", "simplejpeg": "pip install simplejpeg"},
 )

@@ -18,19 +18,19 @@ from typing import TYPE_CHECKING, Any
 
 from hal.auth import host_names, is_loopback, page_link, ssh_tunnel
 from hal.camera import Camera
-from hal.driver import PadReading, RawFrame
+from hal.driver import RawFrame
 from hal.errors import ConnectionLost, HalError
 from hal.gamepad import Gamepad
 from hal.host.process import Channel, Child, SharedMemory
 from hal.host.ring import frame_rings, frame_rings_size
 from hal.keys import find_credentials, needs_keys
 from hal.pads.keyboard import keyboard_table
-from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
+from hal.specs import CameraSpec, GroupSpec, PadSpec, RobotSpec, to_json
 from hal.types import STREAMS, Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
 
 from .messages import ALARMS, Outbox
-from .pad import PadQueue, WebPad, lost_reading, pad_reading
+from .pad import PadQueue, WebPad, pad_reading
 
 if TYPE_CHECKING:
     from hal.rig import Rig
@@ -64,6 +64,8 @@ class WebConsole(Console):
         """
         super().__init__(rig, listen, driven_by=driven_by)
         self._queues: list[PadQueue] = []
+        self.deadman = "l2"
+        """Button that is the dead-man."""
         self._token = secrets.token_urlsafe(_TOKEN_BYTES)
         self._address, self._port = listen.address, listen.port
         self._tls = needs_keys(listen.address) and find_credentials("host") is not None
@@ -129,9 +131,9 @@ class WebConsole(Console):
         """Number that grows with every ``rig.stop()``."""
         return self.rig.stop_count
 
-    def subscribe(self) -> PadQueue:
-        """Return a queue that gets every reading of the page's pad from now on."""
-        queue = PadQueue()
+    def subscribe(self, hand: str) -> PadQueue:
+        """Return a queue that gets every reading of the page's pad, or of a hand of its headset, from now on."""
+        queue = PadQueue(hand)
         self._queues.append(queue)
         return queue
 
@@ -141,9 +143,9 @@ class WebConsole(Console):
         if not on:
             self._report_loss("the tour has ended")
 
-    def _put_reading(self, found: PadReading) -> None:
+    def _put_pad(self, message: Mapping[str, Any]) -> None:
         for queue in self._queues:
-            queue.put(found)
+            queue.put(pad_reading(message, queue.hand, self.deadman))
 
     # What pages show.
 
@@ -151,6 +153,7 @@ class WebConsole(Console):
         self._channel.send("say", t=time.monotonic(), text=text)
 
     def explain(self, labels: Mapping[str, Any]) -> None:
+        self.deadman = str(labels["deadman"])
         self._channel.send("labels", labels=dict(labels))
 
     def show_driving(self, view: DrivingView) -> None:
@@ -183,13 +186,13 @@ class WebConsole(Console):
 
     def _process_lost(self) -> None:
         self.driver = None
-        self._put_reading(lost_reading(time.monotonic(), 0))
+        self._put_pad({"connected": False, "t": time.monotonic()})
         print("the console has ended: no page can drive or stop any more; start the program again", file=sys.stderr)
 
     def _receive(self, message: dict[str, Any]) -> None:
         if "pad" in message:
             pad = message["pad"]
-            self._put_reading(pad_reading(pad, 0))
+            self._put_pad(pad)
             if not pad["connected"]:
                 self._report_loss(str(pad["why"]))
             else:
@@ -262,7 +265,8 @@ class WebConsole(Console):
         self._channel.send("refused", page=page, why=why)
 
     def _pad(self) -> Gamepad | None:
-        return next((pad for pad in self.rig.gamepads.values() if isinstance(pad.driver, WebPad)), None)
+        pads = [pad for pad in self.rig.gamepads.values() if isinstance(pad.driver, WebPad)]
+        return next((pad for pad in pads if not pad.driver.spec.hand), None)
 
     def _send_waiting_controls(self) -> None:
         """Send the names of the controls that must be released first, if they changed."""
@@ -382,12 +386,12 @@ def _rig_message(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None)
     return {
         "source": rig.plan.source,
         "sim": rig.plan.sim,
-        "attended": rig.attended,
         "emulated": rig.emulated,
         "stage": f"/3d/{secrets.token_urlsafe(_TOKEN_BYTES)}" if rig.viewer3d is not None else "",
         "drivable": driven_by is None,
         "driven_by": driven_by,
         "demo": driven_by is None and (rig.emulated or not rig.attended),
+        "hands": sorted({pad.hand or "any" for pad in _page_pads(rig)}),
         "pad_may_hold": not rig.attended or _accepts_silent_pads(rig),
         "robots": [_robot_message(robot) for robot in rig.plan.robots],
         "cameras": [
@@ -396,7 +400,6 @@ def _rig_message(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None)
                 "width": camera.width,
                 "height": camera.height,
                 "rate_hz": camera.rate_hz,
-                "driver": camera.driver,
                 "shows": camera.streams[0],
             }
             for camera in cameras
@@ -410,18 +413,19 @@ def _robot_message(robot: RobotSpec) -> dict[str, Any]:
         "model": robot.model,
         "real": robot.attended,
         "driver": robot.driver,
-        "rate_hz": robot.rate_hz,
         "joints": list(robot.joints),
         "lower": list(robot.limits.lower),
         "upper": list(robot.limits.upper),
-        "velocity": list(robot.limits.velocity),
         "widths": [robot.gripper.width_min, robot.gripper.width_max] if robot.gripper is not None else None,
     }
 
 
+def _page_pads(rig: Rig) -> list[PadSpec]:
+    return [pad for pad in rig.plan.pads if pad.driver in ("auto", "web")]
+
+
 def _accepts_silent_pads(rig: Rig) -> bool:
-    ours = [pad for pad in rig.plan.pads if pad.driver in ("auto", "web")]
-    return any(pad.options.get("accept_silent_pad") is True for pad in ours)
+    return any(pad.options.get("accept_silent_pad") is True for pad in _page_pads(rig))
 
 
 def _group_message(spec: GroupSpec) -> dict[str, Any]:

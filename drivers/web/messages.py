@@ -8,12 +8,15 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
+from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
 from hal.views import ACTIONS, FRAMES, SETTINGS
 
+HANDS = ("any", "left", "right")
+"""Hands that may hold: ``any`` for the pad of the whole page, the others for a pad of their own."""
 MAX_BYTES = 4096
 """Longest message of a page."""
 PAGE_CLOSED = "the page in control was closed"
@@ -35,8 +38,8 @@ _MIN_SPEED = 0.01
 """Smallest share of the mapping's speeds that a page may set."""
 _RANGES = tuple((0.0 if axis in ONE_SIDED else -1.0, 1.0) for axis in STICK_AXES)
 _MASKS = 1 << len(BUTTONS)
-_POSE = ((-100.0, 100.0),) * 3 + ((-1.01, 1.01),) * 4
-"""Ranges of a pose: m, and a unit quaternion."""
+_HAND = ((-100.0, 100.0),) * 3 + ((-1.01, 1.01),) * 4 + ((0.0, 1.0),)
+"""Ranges of a hand's pose (m, and a unit quaternion) and grip."""
 _MAX_TIME = 1e9
 """ms, and s: more than any clock here shows."""
 
@@ -56,8 +59,8 @@ class PadMessage(NamedTuple):
     """In the order of ``hal.types.STICK_AXES``: sticks -1..1, triggers 0..1."""
     buttons: int
     """Bit k: button k of ``hal.types.BUTTONS`` is pressed."""
-    pose: tuple[float, ...] = ()
-    """That of ``hal.types.PadState``."""
+    hands: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+    """Side of a hand that holds, of :data:`HANDS` -> its pose (that of ``hal.types.PadState``) and grip, (8,)."""
 
 
 class PageLeft(NamedTuple):
@@ -145,22 +148,23 @@ class _Names(NamedTuple):
     cameras: Collection[str]
 
 
-def _pad_message(_: _Names, seen: object, since: object, axes: object, buttons: object) -> PadMessage:
-    if type(buttons) is not int or not 0 <= buttons < _MASKS:
-        raise MalformedMessage("not a mask of buttons")
+def _pad_message(_: _Names, seen: object, since: object, axes: object, buttons: object, hands: object) -> PadMessage:
+    if type(buttons) is not int or not 0 <= buttons < _MASKS or not isinstance(hands, dict):
+        raise MalformedMessage("not a mask of buttons, or no hands")
     return PadMessage(
         seen=_number(seen, 0.0, _MAX_TIME),
         since=_number(since, 0.0, _MAX_TIME) / 1000.0,
         axes=_numbers(axes, _RANGES),
         buttons=buttons,
+        hands={_check_choice(side, HANDS): _hand(numbers) for side, numbers in hands.items()},
     )
 
 
-def _hand_message(_: _Names, pose: object, **pad: object) -> PadMessage:
-    numbers = _numbers(pose, _POSE)
-    if not 0.99 < math.hypot(*numbers[3:]) < 1.01:
+def _hand(values: object) -> tuple[float, ...]:
+    numbers = _numbers(values, _HAND)
+    if not 0.99 < math.hypot(*numbers[3:7]) < 1.01:
         raise MalformedMessage("not a unit quaternion")
-    return _pad_message(_, **pad)._replace(pose=numbers)
+    return numbers
 
 
 def _setting(known: _Names, name: object, value: object) -> DriverRequest:
@@ -183,8 +187,7 @@ def _watch(known: _Names, cameras: object) -> WatchRequest:
 
 
 _MESSAGES: dict[str, tuple[set[str], Callable[..., PageMessage]]] = {
-    "pad": ({"seen", "since", "axes", "buttons"}, _pad_message),
-    "hand": ({"seen", "since", "axes", "buttons", "pose"}, _hand_message),
+    "pad": ({"seen", "since", "axes", "buttons", "hands"}, _pad_message),
     "away": ({"why"}, lambda _, why: PageLeft(_LEFT[_check_choice(why, _LEFT)])),
     "lease": ({"take"}, lambda _, take: ControlRequest(_flag(take))),
     "stop": (set(), lambda _: StopRequest()),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import struct
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -26,7 +25,6 @@ from hal.types import STREAMS
 
 from .messages import MalformedMessage, PictureDrawn, WatchRequest, parse
 from .sockets import PageSocket, PageSockets
-from .telemetry import round_number
 
 _HEADER = struct.Struct("<BBHIdf")  # camera, 0, 0, seq, t, age
 _SEQ_MASK = 0xFFFFFFFF
@@ -42,8 +40,6 @@ _REACH = 8.0
 _LONE = 0.6
 """A pixel that differs from the mean of its neighbours by this share of the local contrast becomes that mean."""
 _AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
-_RATE_WINDOW = 2.0
-"""Time over which the rate of pictures is taken, in s."""
 
 
 class JpegPicture(NamedTuple):
@@ -73,24 +69,16 @@ class PictureCache:
         for name, feed in self._feeds.items():
             feed.watched = name in cameras
             if not feed.watched:
-                feed.forget()
+                feed.frame = feed.picture = None
 
-    def take_frame(self, camera: str, now: float) -> bool:
-        """Take the camera's newest frame out of the ring.
-
-        Args:
-            camera: Name of the camera of which the app announced a frame.
-            now: Present time, in s, monotonic.
-
-        Returns:
-            Whether there is a new frame that a page watches.
-        """
+    def take_frame(self, camera: str) -> bool:
+        """Take a camera's newest frame out of the ring; return whether there is a new one that a page watches."""
         feed = self._feeds.get(camera)
         if feed is None or not feed.watched:
             return False
         frame = self._rings[camera].wait(feed.seq, 0.0)
         if frame is not None:
-            feed.put(frame, now)
+            feed.frame, feed.seq = frame, frame.seq
         return frame is not None
 
     def newest_seq(self, camera: str) -> int:
@@ -118,10 +106,6 @@ class PictureCache:
         finally:
             feed.pending = None
 
-    def report(self, now: float) -> dict[str, dict[str, float | None]]:
-        """Return the rate (1/s) and age (s) of every camera's pictures; None where unknown or not watched."""
-        return {name: feed.report(now) for name, feed in self._feeds.items()}
-
 
 class _CameraFeed:
     """Newest frame and picture of one camera."""
@@ -134,25 +118,6 @@ class _CameraFeed:
         self.frame: RawFrame | None = None
         self.picture: JpegPicture | None = None
         self.pending: asyncio.Future[None] | None = None
-        self._arrivals: deque[float] = deque(maxlen=256)
-
-    def forget(self) -> None:
-        self.frame = self.picture = None
-        self._arrivals.clear()
-
-    def put(self, frame: RawFrame, now: float) -> None:
-        self.frame, self.seq = frame, frame.seq
-        self._arrivals.append(now)
-
-    def report(self, now: float) -> dict[str, float | None]:
-        times = self._arrivals
-        while times and now - times[0] > _RATE_WINDOW:
-            times.popleft()
-        span = times[-1] - times[0] if times else 0.0
-        return {
-            "fps": round((len(times) - 1) / span, 1) if span > 0.0 else None,
-            "age": round_number(now - self.frame.t) if self.frame is not None else None,
-        }
 
 
 # Sending them.
@@ -239,9 +204,9 @@ class PictureSockets(PageSockets):
             self._cache.watch(watched)
             self._watched(watched)
 
-    def frame_arrived(self, camera: str, now: float) -> None:
-        """Send a new frame of this camera to the pages that watch it; ``now`` in s, monotonic."""
-        if self._cache.take_frame(camera, now):
+    def frame_arrived(self, camera: str) -> None:
+        """Send a new frame of this camera to the pages that watch it."""
+        if self._cache.take_frame(camera):
             for credit in self._pages:
                 if camera in credit.cameras:
                     credit.changed.set()

@@ -83,11 +83,11 @@ class ConsoleServer:
         if self._tls is not None:
             self._tls.verify_mode = ssl.CERT_NONE  # browsers have no certificate: the token in the link says who may
         self._telemetry = Telemetry(config["hosts"], hosts)
-        self._cache = PictureCache(cameras, frame_rings(pictures, cameras))
         self._app_channel = AppChannel(channel, self._receive_from_app)
         self._session = WebSession(config["rig"], self._app_channel.queue, self._app_channel.flush)
         self._live = LiveSockets(auth, self._session)
-        self._pictures = PictureSockets(auth, self._cache, self._send_watched)
+        cache = PictureCache(cameras, frame_rings(pictures, cameras))
+        self._pictures = PictureSockets(auth, cache, self._send_watched)
         self._connections = ConnectionLimit()
         files = read_page_files() | {"keys.js": keys_module(config["keyboard"])}
         stage = Stage(config["viewer"], config["rig"]["stage"])
@@ -114,7 +114,7 @@ class ConsoleServer:
     def _receive_from_app(self, message: dict[str, Any]) -> None:
         method = message["method"]
         if method == "frame":
-            self._pictures.frame_arrived(message["camera"], time.monotonic())
+            self._pictures.frame_arrived(message["camera"])
         elif method == "close":
             self._app_channel.ended.set()
         else:
@@ -135,9 +135,7 @@ class ConsoleServer:
             self._pictures.abort_stuck(now)
             self._connections.close_idle(now)
             if self._session.pages:
-                self._session.send_state(
-                    {"t": now, "late": late, **self._telemetry.snapshot(now), "cameras": self._cache.report(now)}
-                )
+                self._session.send_state({"t": now, "late": late, **self._telemetry.snapshot(now)})
             due = max(due + _STATE_PERIOD, now)
             await asyncio.sleep(due - now)
 

@@ -257,7 +257,7 @@ class WebSession:
             self._lose_pad(now, verdict.lost)
         if verdict.t_alive is not None:
             pad = {"connected": True, "t": now, "t_alive": verdict.t_alive, "axes": message.axes}
-            pad |= {"buttons": message.buttons, "pose": message.pose, "from": page.name}
+            pad |= {"buttons": message.buttons, "hands": message.hands, "from": page.name}
             self._to_app.put_newest("pad", {"pad": pad})
         self._flush()
         page.queue.put_newest("beat", encode({"type": "beat", "t": watch.stamp(now)}))

@@ -64,6 +64,7 @@ def drive_left(bench: Bench, page: Browser, speed: float = 0.1) -> None:
 def let_go_of_all(page: Browser) -> None:
     page.key("ArrowLeft", "ArrowLeft", False)
     page.let_go()
+    page.run("window.rest?.()")  # the hands of a headset
 
 
 def lines(page: Browser, words: str) -> int:

@@ -1,4 +1,4 @@
-"""Driving with the hand controller of a headset, which Meta's emulator of WebXR (IWER, MIT) plays in the browser."""
+"""Driving with the hand controllers of a headset, which Meta's emulator of WebXR (IWER, MIT) plays in the browser."""
 
 from __future__ import annotations
 
@@ -7,25 +7,46 @@ import shutil
 import subprocess
 import tarfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from .kit import Bench, Browser, wait_for
+from .kit import Bench, Browser, need_browser, wait_for
 from .moves import BRIEF, clear_trip, undisturbed
+from .test_settings import TWO_ARMS
+
+TWO_HANDS = TWO_ARMS | {
+    "gamepads": {
+        "page": {"driver": "web", "drives": "left"},
+        "hand": {"driver": "web", "drives": "right", "options": {"hand": "right"}},
+    },
+}
 
 IWER, DIGEST = "iwer@2.5.0", "23d8640949f19db4b1e70398b30e084e4aa555f3a81e4329da3fac1a70b39542"
 WEAR = """
 if (self === top) {
   window.device = new IWER.XRDevice(IWER.metaQuest3);
   device.installRuntime({ forceInstall: true }); // in place of the browser's own, which has no device
-  window.hand = device.controllers.right;
+  window.hands = device.controllers;
+  window.hand = hands.right;
   Object.assign(window, { blind: false, steady: false, speed: [0, 0, 0] }); // speed in m per picture
   Object.defineProperty(XRPose.prototype, 'emulatedPosition', { get: () => blind });
+  window.rest = () => {
+    Object.assign(window, { blind: false, steady: false, speed: [0, 0, 0] });
+    hand.connected = true;
+    device.updateVisibilityState('visible');
+    for (const one of Object.values(hands)) {
+      for (const name of ['squeeze', 'trigger']) one.updateButtonValue(name, 0);
+    }
+    hand.updateButtonValue('a-button', 0);
+  };
   let tremble = 1e-5;
   const live = () => {
     requestAnimationFrame(live);
+    hands.left.position.y += tremble;
     if (steady) return;
     hand.position.x += speed[0] + (tremble = -tremble);
     hand.position.y += speed[1];
@@ -53,16 +74,32 @@ def iwer(pytestconfig: pytest.Config) -> str:
     return script.decode()
 
 
-@pytest.fixture
-def worn(bench: Bench, page: Browser, iwer: str) -> Iterator[Browser]:
-    """The page in control, in a headset that shows it."""
+@contextmanager
+def emulated(bench: Bench, page: Browser, iwer: str) -> Iterator[Browser]:
+    """Open the page in a browser that has a headset."""
     script = page.cdp("Page.addScriptToEvaluateOnNewDocument", source=iwer + WEAR)["identifier"]
     page.open(bench.link)
     page.wait_driving()
-    clear_trip(bench, page)
     yield page
     page.cdp("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+
+
+@pytest.fixture
+def worn(bench: Bench, page: Browser, iwer: str) -> Iterator[Browser]:
+    """The page in control, in a headset that shows it."""
+    with emulated(bench, page, iwer):
+        clear_trip(bench, page)
+        yield page
     bench.rig.world.reset("panda")
+
+
+@pytest.fixture
+def two() -> Iterator[Bench]:
+    """Two arms, one for each hand."""
+    need_browser()
+    bench = Bench(rig=TWO_HANDS, robots=("left", "right"))
+    yield bench
+    bench.close()
 
 
 def wear(page: Browser) -> None:
@@ -79,15 +116,9 @@ def squeeze(bench: Bench, page: Browser, value: float = 1.0) -> None:
     wait_for(lambda: bench.deadman.held == bool(value), f"the squeeze {value}", BRIEF)
 
 
-RESTING = """Object.assign(window, { blind: false, steady: false, speed: [0, 0, 0] });
-    hand.connected = true;
-    device.updateVisibilityState('visible');
-    for (const one of ['squeeze', 'trigger', 'a-button']) hand.updateButtonValue(one, 0);"""
-
-
 def rest(bench: Bench, page: Browser) -> None:
     """Release, for as long as a person does between two squeezes."""
-    page.run(RESTING)
+    page.run("rest()")
     wait_for(lambda: not bench.deadman.held and bench.rests(), "the arm to rest", BRIEF)
     two = "requestAnimationFrame(() => requestAnimationFrame(done))"  # pictures that show it released
     page.run(f"return new Promise((done) => setTimeout(() => {two}, 250))")
@@ -129,21 +160,24 @@ def test_the_arm_follows_the_hand_while_it_is_squeezed_and_never_jumps(bench: Be
 
 def glide(page: Browser, step: tuple[float, float, float]) -> None:
     """Move the hand by ten steps, m, one with each picture."""
-    page.run(
-        """const step = arguments[0]; speed = [0, 0, 0];
-        return new Promise((done) => {
-          let left = 10;
-          const next = () => {
-            if (left-- === 0) return done();
-            hand.position.x += step[0];
-            hand.position.y += step[1];
-            hand.position.z += step[2];
-            requestAnimationFrame(next);
-          };
-          next();
-        })""",
-        list(step),
-    )
+    page.run("speed = [0, 0, 0];" + GLIDE, [0, 0, 0], list(step))
+
+
+GLIDE = """const steps = { left: arguments[0], right: arguments[1] };
+    return new Promise((done) => {
+      let rest = 10;
+      const next = () => {
+        if (rest-- === 0) return done();
+        for (const [side, [x, y, z]] of Object.entries(steps)) {
+          hands[side].position.x += x;
+          hands[side].position.y += y;
+          hands[side].position.z += z;
+        }
+        requestAnimationFrame(next);
+      };
+      next();
+    })"""
+LATER = "return new Promise((done) => setTimeout(done, arguments[0]))"
 
 
 LOSSES = {
@@ -179,3 +213,55 @@ def test_every_loss_of_the_hand_lets_go(bench: Bench, worn: Browser) -> None:
 
     for what, (happens, ends) in LOSSES.items():
         undisturbed(bench, worn, partial(lose, what, happens, ends))
+
+
+def test_two_hands_drive_two_arms(two: Bench, browser: Browser, iwer: str) -> None:
+    """Each with a dead-man, a clutch and a gripper of its own."""
+    arms = {arm.robot.name: arm for arm in two.session.arms}
+
+    def tcps() -> np.ndarray:
+        return np.array([arm.robot.state(max_age=2.0).tcp.position for arm in arms.values()])
+
+    def press(side: str, button: str, value: float) -> None:
+        browser.run(f"hands.{side}.updateButtonValue({button!r}, {value})")
+        if button == "squeeze":
+            wait_for(lambda: arms[side].deadman.held == bool(value), f"the {side} squeeze {value}", BRIEF)
+
+    def move(left: tuple[float, float, float], right: tuple[float, float, float], *ways: tuple[float, ...]) -> None:
+        """Move both hands by ten steps, and wait until the arms went these ways."""
+        to = tcps() + ways
+        browser.run(GLIDE, list(left), list(right))
+        wait_for(lambda: abs(tcps() - to).max() < 2e-3, f"the ways {ways}", BRIEF)
+
+    def drive() -> None:
+        browser.run("rest()")
+        pads = [arm.pad for arm in arms.values()]
+        wait_for(lambda: all(pad.state().connected and not pad.waiting_for for pad in pads), "the pads", BRIEF)
+        wait_for(lambda: not two.session.held, "both hands to be released", BRIEF)
+        browser.run(LATER, 400)
+        start = tcps()
+        press("left", "squeeze", 1)
+        press("right", "squeeze", 1)
+        browser.run(LATER, 250)
+        assert abs(tcps() - start).max() < 1e-4, "a squeeze moves nothing"
+        move((0, 0, -0.01), (0, 0.01, 0), (0.1, 0, 0), (0, 0, 0.1))
+        press("left", "squeeze", 0)
+        assert arms["right"].deadman.held, "the other hand holds on"
+        move((-0.02, 0.01, 0), (0, 0, -0.01), (0, 0, 0), (0.1, 0, 0))
+        browser.run(LATER, 250)
+        press("left", "squeeze", 1)
+        move((-0.01, 0, 0), (0, 0, 0), (0, 0.1, 0), (0, 0, 0))
+        press("left", "trigger", 1)
+        wait_for(lambda: arms["left"].robot.gripper.state(max_age=2.0).width < 0.01, "the left fingers to close", BRIEF)
+        assert arms["right"].robot.gripper.state(max_age=2.0).width > 0.07
+        browser.run("hands.right.connected = false")
+        wait_for(lambda: not arms["right"].deadman.held, "the lost hand to let go", BRIEF)
+        move((0, -0.01, 0), (0, 0, -0.01), (0, 0, -0.1), (0, 0, 0))
+        browser.run("device.updateVisibilityState('visible-blurred')")
+        wait_for(lambda: not two.session.held, "both to let go", BRIEF)
+
+    with emulated(two, browser, iwer):
+        browser.size(640, 480)  # less to draw
+        wear(browser)
+        undisturbed(two, browser, drive)
+        browser.chrome.get("about:blank")

@@ -70,7 +70,7 @@ def web_pad() -> Iterator[PadBench]:
         stop_count = 0
         there, frozen, mask = True, False, 0
 
-        def subscribe(self) -> PadQueue:
+        def subscribe(self, hand: str) -> PadQueue:
             return self.queue
 
         def show_playing(self, on: bool) -> None:
@@ -84,10 +84,10 @@ def web_pad() -> Iterator[PadBench]:
                 "t_alive": now,
                 "axes": axes,
                 "buttons": self.mask,
-                "pose": (),
+                "hands": {},
             }
             if not self.frozen:
-                self.queue.put(pad_reading(message, 0))
+                self.queue.put(pad_reading(message))
 
     page = Page()
     driver = WebPad(pad_spec(driver="web"), page)

@@ -220,7 +220,7 @@ class Page:
     def pad(self, axes: list[float] = REST, buttons: int = 0, age: float = 0.0) -> dict[str, Any]:
         """A pad message that was sent ``age`` s ago, and was under way since."""
         since = max(0.0, time.monotonic() - self.at - age) * 1000.0
-        return {"type": "pad", "seen": self.seen, "since": since, "axes": axes, "buttons": buttons}
+        return {"type": "pad", "seen": self.seen, "since": since, "axes": axes, "buttons": buttons, "hands": {}}
 
     async def drive(self, axes: list[float] = REST, buttons: int = 0) -> None:
         """One pad message, and its beat."""

@@ -114,9 +114,9 @@ export class Heartbeat {
     this.#sentAt = now;
     if (this.#probe === null || now - this.#probe > 1000) this.#probe = now;
     const axes = this.pad.axes.map((value) => Math.round(value * 1e4) / 1e4);
-    const state = { seen: this.#seen, since: performance.now() - this.#seenAt, axes, buttons: this.pad.mask };
-    const { pose } = this.pad;
-    this.connection.send(pose.length ? { type: "hand", ...state, pose } : { type: "pad", ...state });
+    const since = performance.now() - this.#seenAt;
+    const { mask, hands } = this.pad;
+    this.connection.send({ type: "pad", seen: this.#seen, since, axes, buttons: mask, hands });
   }
 }
 

@@ -1,18 +1,17 @@
-// The hand of a headset's controller, or of a phone in AR, as a source of the pad (WebXR).
+// The hands of a headset's controllers, or of a phone in AR, as part of the pad (WebXR).
 //
-// The squeeze (on a phone: a finger on the screen) is the dead-man, the trigger the gripper. The pose of the hand is
-// sent with the pad while it holds; the program moves the arm by as much as the hand has moved since the squeeze.
+// The squeeze (on a phone: a finger on the screen) is the dead-man, the trigger the gripper. The pose of a hand is sent
+// with the pad while it holds; the program moves the arm by as much as the hand has moved since the squeeze.
 
 import { byId, setText, show } from "./dom.js";
 import { PAD_SILENCE } from "./keys.js";
-import { AXIS } from "./pad.js";
 
 const [TRIGGER, SQUEEZE, ...STOPS] = [0, 1, 4, 5]; // of the mapping xr-standard; STOPS are A and B, or X and Y
 const PRESSED = 0.5; // share of the squeeze's travel from which it holds
 const RELEASED = 0.3;
 const SILENCE = 1000 * PAD_SILENCE; // ms
-/** Time for which all squeezes are released before one holds, ms: if the program missed a release, it missed more than
- * a dead-man may be silent for, so that the arm has tripped and does not follow a hand that is elsewhere by now. */
+/** Time for which the squeezes of an arm are released before one holds, ms: if the program missed a release, it missed
+ * more than a dead-man may be silent for, so that the arm has tripped and does not follow a hand that is elsewhere. */
 const PAUSE = 1.25 * SILENCE;
 const ENTER = "Headset";
 const LEAP = 0.1; // m between two pictures, as no hand moves
@@ -45,6 +44,93 @@ function headingOf({ x, y, z, w }) {
 /** How far a source is squeezed, 0..1. @param {any} source */
 const squeezeOf = (source) => source.gamepad?.buttons[SQUEEZE]?.value ?? Number(source.targetRayMode === "screen");
 
+/** What drives one arm: the controller of one hand, or any whose hand has no arm of its own. */
+class Hand {
+  /** @param {Headset} headset @param {string} side "left", "right" or "any" */
+  constructor(headset, side) {
+    this.headset = headset;
+    this.side = side;
+    /** Pose in the axes of an arm's base (x, y, z in m, and a quaternion); empty while it does not hold. */
+    this.pose = /** @type {number[]} */ ([]);
+  }
+
+  /** The source that holds. @type {any} */ #source = null;
+  /** Whether every squeeze was released for long enough, since anything held. */
+  #free = false;
+  #heldAt = performance.now();
+  #heading = 0;
+  /** When the pose changed last, ms: a hand that holds still trembles all the same. */
+  #movedAt = 0;
+
+  /** How far the trigger is pulled, 0..1. */
+  get grip() {
+    return this.#source?.gamepad?.buttons[TRIGGER]?.value ?? 0;
+  }
+
+  /** Take a picture of the headset. @param {any} frame @param {any[]} sources that may drive this arm */
+  take(frame, sources) {
+    const squeezed = sources.find((source) => squeezeOf(source) > PRESSED);
+    if (sources.some((source) => squeezeOf(source) >= RELEASED)) this.#heldAt = performance.now();
+    else this.#free ||= performance.now() - this.#heldAt > PAUSE;
+    if (this.#source) this.#follow(frame, sources);
+    else if (squeezed && this.#free) this.#engage(frame, squeezed);
+  }
+
+  /** Return the pose of a source; null while it is not tracked. @param {any} frame @param {any} source */
+  #poseOf(frame, { gripSpace }) {
+    const { space } = this.headset;
+    const pose = gripSpace ? frame.getPose(gripSpace, space) : frame.getViewerPose(space);
+    return pose && !pose.emulatedPosition ? pose.transform : null;
+  }
+
+  /** @param {any} frame @param {any} source */
+  #engage(frame, source) {
+    const viewer = frame.getViewerPose(this.headset.space);
+    const pose = this.#poseOf(frame, source);
+    if (!viewer || !pose) return;
+    this.#source = source;
+    this.#heading = headingOf(viewer.transform.orientation);
+    this.#move(pose);
+  }
+
+  /** @param {any} frame @param {any[]} sources */
+  #follow(frame, sources) {
+    const source = this.#source;
+    if (!sources.includes(source) && source.gamepad) return this.lose("controller disconnected");
+    if (!sources.includes(source) || squeezeOf(source) < RELEASED) return this.release();
+    const pose = this.#poseOf(frame, source);
+    if (!pose) return this.lose("the headset does not see the controller");
+    const before = this.pose;
+    this.#move(pose);
+    const way = Math.hypot(...[0, 1, 2].map((k) => this.pose[k] - before[k]));
+    if (!(way <= LEAP)) return this.lose("the tracking leapt");
+    if (performance.now() - this.#movedAt > SILENCE) this.lose("the controller does not answer");
+  }
+
+  /** @param {any} pose */
+  #move({ position, orientation }) {
+    const now = [...toBase(position, this.#heading), ...toBase(orientation, this.#heading), orientation.w];
+    if (now.some((value, place) => value !== this.pose[place])) this.#movedAt = performance.now();
+    this.pose = now;
+  }
+
+  /** Let go, and say why, if it holds. @param {string} why */
+  lose(why) {
+    if (!this.#source) return;
+    this.#source.gamepad?.hapticActuators?.[0]?.pulse(1, 200);
+    this.release();
+    this.headset.tell(`${why}: its controls are released`);
+  }
+
+  /** Let go: every squeeze must be released before one holds. */
+  release() {
+    this.#free = false;
+    this.#heldAt = performance.now();
+    this.#source = null;
+    this.pose = [];
+  }
+}
+
 export class Headset {
   /**
    * @param {import("./pad.js").Pad} pad @param {import("./deadman.js").Presence} presence
@@ -55,30 +141,25 @@ export class Headset {
     this.presence = presence;
     this.stop = stop;
     this.tell = tell;
-    this.source = pad.source();
+    /** Space of all poses. @type {any} */
+    this.space = null;
     /** Called with every picture of the headset. */
     this.shown = () => {};
-    pad.released.push(() => {
-      this.#free = false;
-      this.#heldAt = performance.now();
-      this.#release();
-    });
+    pad.released.push(() => this.#update((hand) => hand.release()));
     byId("headset").addEventListener("click", () => (this.#session ? this.#session.end() : this.#start()));
     this.#offer();
   }
 
   /** @type {any} */ #session = null;
-  /** @type {any} */ #space = null;
   #mode = "";
-  /** The source that holds. @type {any} */ #hand = null;
-  /** Whether every squeeze was released for long enough, since anything held. */
-  #free = false;
-  #heldAt = 0; // ms
+  /** @type {Hand[]} */ #hands = [];
   #stopping = false;
-  #heading = 0;
   #shownAt = 0; // ms
-  /** When the pose changed last, ms: a hand that holds still trembles all the same. */
-  #movedAt = 0;
+
+  /** Use the hands that drive an arm of this rig. @param {string[]} sides */
+  open(sides) {
+    this.#hands = sides.map((side) => new Hand(this, side));
+  }
 
   async #offer() {
     for (const mode of MODES) {
@@ -96,7 +177,7 @@ export class Headset {
       const gl = document.createElement("canvas").getContext("webgl2", /** @type {any} */ ({ xrCompatible: true }));
       const { XRWebGLLayer } = /** @type {any} */ (window);
       session.updateRenderState({ baseLayer: new XRWebGLLayer(session, gl) }); // without one there are no frames
-      this.#space = await session.requestReferenceSpace("local-floor");
+      this.space = await session.requestReferenceSpace("local-floor");
       this.#session = this.presence.session = session;
       setText(byId("headset"), "Leave headset");
       this.pad.reset();
@@ -116,7 +197,16 @@ export class Headset {
 
   /** Let go where the headset shows no pictures any more; before every message. */
   check() {
-    if (this.#hand && performance.now() - this.#shownAt > SILENCE) this.#lose("the headset hangs");
+    if (!this.#session || performance.now() - this.#shownAt <= SILENCE) return;
+    this.#update((hand) => hand.lose("the headset hangs"));
+  }
+
+  /** Do something with every hand, and take what they do into the pad. @param {(hand: Hand) => void} does */
+  #update(does) {
+    this.#hands.forEach(does);
+    const holding = this.#hands.filter(({ pose }) => pose.length);
+    this.pad.hands = Object.fromEntries(holding.map(({ side, pose, grip }) => [side, [...pose, grip]]));
+    this.pad.update();
   }
 
   /** @param {any} frame */
@@ -128,69 +218,12 @@ export class Headset {
     const stopping = sources.some(({ gamepad }) => STOPS.some((place) => gamepad?.buttons[place]?.pressed));
     if (stopping && !this.#stopping) this.stop();
     this.#stopping = stopping;
-    const squeezed = sources.find((source) => squeezeOf(source) > PRESSED);
-    if (sources.some((source) => squeezeOf(source) >= RELEASED)) this.#heldAt = this.#shownAt;
-    else this.#free ||= this.#shownAt - this.#heldAt > PAUSE;
-    if (this.#hand) this.#follow(frame, sources);
-    else if (squeezed && this.#free) this.#engage(frame, squeezed);
+    this.#update((hand) => hand.take(frame, sources.filter((source) => this.#handOf(source) === hand)));
     this.shown();
   }
 
-  /** Return the pose of a hand; null while it is not tracked. @param {any} frame @param {any} hand */
-  #poseOf(frame, hand) {
-    const pose = hand.gripSpace ? frame.getPose(hand.gripSpace, this.#space) : frame.getViewerPose(this.#space);
-    return pose && !pose.emulatedPosition ? pose.transform : null;
-  }
-
-  /** @param {any} frame @param {any} hand */
-  #engage(frame, hand) {
-    const viewer = frame.getViewerPose(this.#space);
-    const pose = this.#poseOf(frame, hand);
-    if (!viewer || !pose) return;
-    this.#hand = hand;
-    this.#free = false;
-    this.#heading = headingOf(viewer.transform.orientation);
-    this.#movedAt = performance.now();
-    this.#move(pose);
-    this.pad.hold("hand", true);
-  }
-
-  /** @param {any} frame @param {any[]} sources */
-  #follow(frame, sources) {
-    const hand = this.#hand;
-    if (!sources.includes(hand) && hand.gamepad) return this.#lose("controller disconnected");
-    if (!sources.includes(hand) || squeezeOf(hand) < RELEASED) return this.#release();
-    const pose = this.#poseOf(frame, hand);
-    if (!pose) return this.#lose("the headset does not see the controller");
-    const before = this.pad.pose;
-    this.#move(pose);
-    const way = Math.hypot(...[0, 1, 2].map((k) => this.pad.pose[k] - before[k]));
-    if (!(way <= LEAP)) return this.#lose("the tracking leapt");
-    if (performance.now() - this.#movedAt > SILENCE) return this.#lose("the controller does not answer");
-    this.source.axes[AXIS.r2] = hand.gamepad?.buttons[TRIGGER]?.value ?? 0;
-    this.pad.update();
-  }
-
-  /** @param {any} pose */
-  #move({ position, orientation }) {
-    const now = [...toBase(position, this.#heading), ...toBase(orientation, this.#heading), orientation.w];
-    if (this.pad.pose.length && now.every((value, place) => value === this.pad.pose[place])) return;
-    this.#movedAt = performance.now();
-    this.pad.pose = now;
-  }
-
-  /** @param {string} why */
-  #lose(why) {
-    this.#hand.gamepad?.hapticActuators?.[0]?.pulse(1, 200);
-    this.#release();
-    this.tell(`${why}: all controls released`);
-  }
-
-  #release() {
-    if (!this.#hand) return;
-    this.#hand = null;
-    this.pad.pose = [];
-    this.source.clear();
-    this.pad.hold("hand", false);
+  /** @param {any} source */
+  #handOf({ handedness }) {
+    return [handedness, "any"].map((side) => this.#hands.find((hand) => hand.side === side)).find(Boolean);
   }
 }

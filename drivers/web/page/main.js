@@ -69,6 +69,7 @@ const HANDLERS = {
     setData(document.documentElement, "connected", "");
     show(byId("demo"), rig.demo);
     gamepad.mayHold = rig.pad_may_hold;
+    headset.open(rig.hands);
     controls.paint();
     status.waiting = [];
     status.forget();

@@ -93,8 +93,8 @@ export class Pad {
     this.held = false;
     /** Position of the gripper's slider, 0 open .. 1 closed; it stays where it is. */
     this.grip = 0;
-    /** Pose of the hand that holds, in the axes of an arm's base: x, y, z in m, and a quaternion; empty without one. */
-    this.pose = /** @type {number[]} */ ([]);
+    /** Side of a hand that holds -> its pose and grip. "any" holds the dead-man of this pad, another side its own. */
+    this.hands = /** @type {Record<string, number[]>} */ ({});
     this.deadman = "l2";
     /** @type {string | null} */
     this.home = null;
@@ -114,7 +114,7 @@ export class Pad {
   /** @type {Taps} */ #taps;
   /** Mask of the buttons that move nothing, and of those that do. */
   #moveless = 0;
-  #posed = /** @type {number[]} */ ([]);
+  #shown = /** @type {Record<string, number[]>} */ ({});
   #moving = 0;
 
   /** Whether something is pushed that may move the arm. The gripper's slider does not count: it stays where it is. */
@@ -181,7 +181,7 @@ export class Pad {
     let mask = 0;
     for (const source of this.sources) mask |= this.#add(axes, source);
     if (this.deadman !== "r2") axes[AXIS.r2] = Math.max(axes[AXIS.r2], this.grip);
-    if (this.#holding.size) {
+    if (this.#holding.size || this.hands.any) {
       if (this.deadman in AXIS) axes[AXIS[this.deadman]] = 1;
       mask |= BIT[this.deadman];
     }
@@ -215,9 +215,12 @@ export class Pad {
 
   /** @param {number[]} axes @param {number} mask @param {boolean} held */
   #take(axes, mask, held) {
-    const edge = mask !== this.mask || axes.some((value, place) => (value === 0) !== (this.axes[place] === 0));
-    if (!edge && this.pose === this.#posed && axes.every((value, place) => value === this.axes[place])) return;
-    this.#posed = this.pose;
+    const [sides, before] = [this.hands, this.#shown].map((hands) => Object.keys(hands).join());
+    const pressed = mask !== this.mask || sides !== before;
+    const edge = pressed || axes.some((value, place) => (value === 0) !== (this.axes[place] === 0));
+    const same = !edge && (!sides || this.hands === this.#shown);
+    if (same && axes.every((value, place) => value === this.axes[place])) return;
+    this.#shown = this.hands;
     this.axes = axes;
     this.mask = mask;
     this.held = held;

@@ -25,9 +25,9 @@ from hal.drivers.web.messages import (
 from hal.drivers.web.sockets import MAX_MALFORMED, MAX_MESSAGES, RateLimit
 from hal.views import ACTIONS
 
-PAD = {"type": "pad", "seen": 12.5, "since": 20.0, "axes": [0.0, -1, 0.25, 1, 1, 0.0, -1.0, 1], "buttons": 64}
-
-HAND = {**PAD, "type": "hand", "pose": [0.1, -2, 3, 0, 0.6, 0, 0.8]}
+AXES = [0.0, -1, 0.25, 1, 1, 0.0, -1.0, 1]
+PAD = {"type": "pad", "seen": 12.5, "since": 20.0, "axes": AXES, "buttons": 64, "hands": {}}
+HAND = [0.1, -2, 3, 0, 0.6, 0, 0.8, 1]
 
 
 def take(text: str) -> object:
@@ -37,8 +37,8 @@ def take(text: str) -> object:
 @pytest.mark.parametrize(
     ("message", "record"),
     [
-        (PAD, PadMessage(12.5, 0.02, (0.0, -1.0, 0.25, 1.0, 1.0, 0.0, -1.0, 1.0), 64)),
-        (HAND, PadMessage(12.5, 0.02, (0.0, -1.0, 0.25, 1.0, 1.0, 0.0, -1.0, 1.0), 64, (0.1, -2, 3, 0, 0.6, 0, 0.8))),
+        (PAD, PadMessage(12.5, 0.02, tuple(AXES), 64, {})),
+        ({**PAD, "hands": {"left": HAND}}, PadMessage(12.5, 0.02, tuple(AXES), 64, {"left": tuple(HAND)})),
         ({"type": "away", "why": "hidden"}, PageLeft("the page was hidden")),
         *(({"type": "lease", "take": take}, ControlRequest(take)) for take in (True, False)),
         ({"type": "stop"}, StopRequest()),
@@ -93,11 +93,10 @@ def with_axis(value: str) -> str:
         *map(with_axis, ["9" * 3000, "0.25, 0.25"]),
         *(json.dumps({**PAD, key: value}) for key, values in WRONG_FIELDS.items() for value in values),
         *(
-            json.dumps({**HAND, "pose": wrong})
-            for wrong in ([], [0] * 7, [0] * 6 + [2], [200, 0, 0, 0, 0, 0, 1], [1] * 8)
+            json.dumps({**PAD, "hands": {"left": wrong}})
+            for wrong in ([], HAND[:7], [0] * 8, [0] * 6 + [2, 0], [200, *HAND[1:]], [*HAND[:7], 1.1], [1] * 9, "hand")
         ),
-        json.dumps({**PAD, "pose": HAND["pose"]}),
-        json.dumps({**PAD, "type": "hand"}),
+        *(json.dumps({**PAD, "hands": wrong}) for wrong in ([], [HAND], {"third": HAND}, None)),
         '{"type":"pad"}',
         '{"type":"stop","now":true}',
         '{"type":"stopp"}',

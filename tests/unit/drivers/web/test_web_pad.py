@@ -8,6 +8,7 @@ import threading
 import pytest
 from errors_kit import raises_code
 
+from hal import registry
 from hal.config.files import Problems
 from hal.config.models import load_pad_models
 from hal.driver import PadReading
@@ -30,7 +31,7 @@ class Page:
         self.playing: list[bool] = []
         self.stop_count = 0
 
-    def subscribe(self) -> PadQueue:
+    def subscribe(self, hand: str) -> PadQueue:
         return self.queue
 
     def show_playing(self, on: bool) -> None:
@@ -38,11 +39,11 @@ class Page:
 
     def send(self, t: float, mask: int = 0, **axes: float) -> None:
         values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in STICK_AXES]
-        message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask, "pose": ()}
-        self.queue.put(pad_reading(message, 0))
+        message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask, "hands": {}}
+        self.queue.put(pad_reading(message))
 
     def leave(self, t: float) -> None:
-        self.queue.put(pad_reading({"connected": False, "t": t, "why": "hidden"}, 0))
+        self.queue.put(pad_reading({"connected": False, "t": t, "why": "hidden"}))
 
 
 @pytest.fixture
@@ -65,6 +66,19 @@ def test_axes_and_buttons_have_their_names(page: Page, pad: WebPad) -> None:
     assert found.buttons == {"south"}
     assert {name: value for name, value in found.axes.items() if value} == {"left_x": 0.5, "dpad_y": -1.0}
     assert (found.t, found.t_alive) == (0.999, 0.999)
+
+
+def test_each_hand_holds_a_dead_man_of_its_own() -> None:
+    """And neither that of the page, whose controls move neither of them."""
+    hand = (0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0, 0.7)
+    message = {"connected": True, "t": 1.0, "t_alive": 1.0, "axes": [0.5] * 8, "buttons": SOUTH}
+    message["hands"] = {"left": hand}
+    left, right, page = (pad_reading(message, side, "l1") for side in ("left", "right", "any"))
+    assert (left.buttons, left.pose, left.axes["r2"], left.axes["left_x"]) == ({"l1", "r2"}, hand[:7], 0.7, 0.0)
+    assert (right.connected, right.buttons, right.pose, set(right.axes.values())) == (True, frozenset(), (), {0.0})
+    assert (page.buttons, page.pose, page.axes["left_x"]) == ({"south"}, (), 0.5)
+    page = pad_reading({**message, "hands": {"any": hand}})
+    assert (page.buttons, page.pose, page.axes["r2"]) == ({"south", "r2"}, hand[:7], 0.7)
 
 
 def test_a_repeated_state_proves_life_and_is_no_event(page: Page, pad: WebPad) -> None:
@@ -195,7 +209,13 @@ def test_a_rig_without_a_console_is_refused() -> None:
         WebPad(PadSpec("pad", "web", None)).open()
 
 
+def test_a_hand_is_left_or_right() -> None:
+    specs = [PadSpec("pad", "web", None, options=options) for options in ({}, {"hand": "left"}, {"hand": "middle"})]
+    codes = [[code for *_, code in registry.check_record("web", "gamepad", spec)] for spec in specs]
+    assert codes == [[], [], ["unknown_hand"]]
+
+
 def test_a_lost_pad_has_nothing_pressed() -> None:
-    lost = lost_reading(3.0, 7)
+    lost = lost_reading(3.0)
     assert (lost.connected, lost.buttons, set(lost.axes.values())) == (False, frozenset(), {0.0})
     assert lost.t_alive == -math.inf

@@ -64,7 +64,7 @@ class Room:
 
     def pad(self, page: WebPage, seen: float, since: float = 0.0, axes: list[float] | None = None) -> None:
         axes = [0.0] * 8 if axes is None else axes
-        self.say(page, type="pad", seen=seen, since=since, axes=axes, buttons=0)
+        self.say(page, type="pad", seen=seen, since=since, axes=axes, buttons=0, hands={})
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_only_the_pad_of_the_page_that_drives_counts(room: Room) -> None:
     room.now = 100.02
     room.pad(driver, 100.0, 20.0, [0.5, 0, 0, 0, 1, 0, 0, -1])
     axes = (0.5, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0)
-    pad = {"connected": True, "t": 100.02, "t_alive": 100.02, "axes": axes, "buttons": 0, "pose": (), "from": "page 1"}
+    pad = {"connected": True, "t": 100.02, "t_alive": 100.02, "axes": axes, "buttons": 0, "hands": {}, "from": "page 1"}
     assert (room.app.news(), inbox(driver)) == ([{"pad": pad}], [{"type": "beat", "t": 100.02}])
 
 
@@ -233,7 +233,7 @@ def test_every_page_stops_and_only_the_driver_recovers_and_plays(room: Room) -> 
         {"type": "recover", "robot": "iiwa"},
         {"type": "watch", "cameras": []},
         {"type": "drawn", "camera": "scene"},
-        {"type": "pad", "seen": 100.5, "since": 0, "axes": [0] * 8, "buttons": 0},
+        {"type": "pad", "seen": 100.5, "since": 0, "axes": [0] * 8, "buttons": 0, "hands": {}},
     ],
 )
 def test_malformed_here(room: Room, message: dict[str, Any]) -> None:
