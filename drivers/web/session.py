@@ -185,11 +185,9 @@ class WebSession:
         """Judges the pad of that page; a new one with each grant, so that messages from before do not count."""
         self._why = ""
         """Reason of the last change of control, for people; empty if no page lost it."""
-        self._labels: str | None = None
+        self._kept: dict[str, str] = {}
+        """Type of a message that pages get when they open -> the newest one."""
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
-        self._waiting_for: list[str] = []
-        self._recording: str | None = None
-        self._driving: str | None = None
         self._settings: frozenset[str] = frozenset()
         self._actions: frozenset[str] = frozenset()
         self.pages: dict[str, WebPage] = {}
@@ -203,16 +201,9 @@ class WebSession:
         page = WebPage(self._opened, overflow)
         self.pages[page.name] = page
         page.queue.put_note(encode({"type": "hello", "page": page.number, "name": page.name, "rig": self._rig}))
-        if self._labels is not None:
-            page.queue.put_note(self._labels)
-        if self._driving is not None:
-            page.queue.put_note(self._driving)
         self._send_lease(page, self._clock())
-        page.queue.put_note(self._waiting_message())
-        for text in self._lines:
+        for text in (*self._kept.values(), *self._lines):
             page.queue.put_note(text)
-        if self._recording is not None:
-            page.queue.put_newest("recording", self._recording)
         return page
 
     def close_page(self, page: WebPage) -> None:
@@ -288,7 +279,7 @@ class WebSession:
         elif self._driver != page.name:
             why = f"only the page in control may {request.what}"
         elif wanted.get("action", "") not in ("", *self._actions):
-            why = "that cannot be done now" if self._recording else "this program records nothing"
+            why = "that cannot be done now" if "recording" in self._kept else "this program records nothing"
         elif wanted.get("setting", "") not in ("", *self._settings):
             why = f"this program does not let a page set the {wanted['setting']}"
         elif not self._to_app.put({**wanted, "page": page.name}):
@@ -322,19 +313,18 @@ class WebSession:
         """Pass a message of the app on to the pages that it is for, and keep it for those that open later."""
         method = message["method"]
         if method == "labels":
-            self._labels = self._send_all({"type": "labels", **message["labels"]})
+            self._keep({"type": "labels", **message["labels"]})
         elif method == "say":
             line = {"type": "say", "t": message["t"], "text": message["text"]}
             line |= {name: message[name] for name in ("loss", "stop") if name in message}
             self._lines.append(self._send_all(line))
         elif method == "waiting":
-            self._waiting_for = list(message["controls"])
-            self._send_text_to_all(self._waiting_message())
+            self._keep({"type": "pad", "waiting": message["controls"]})
         elif method == "playing":
             self.playing = bool(message["on"])
         elif method == "driving":
             self._settings = frozenset(message["view"]["settings"])
-            self._driving = self._send_all({"type": "driving", **message["view"]})
+            self._keep({"type": "driving", **message["view"]})
         elif method == "recording":
             self._show_recording(message["t"], message["view"])
         elif method == "refused":
@@ -343,25 +333,22 @@ class WebSession:
                 self._refuse(page, message["why"])
 
     def _show_recording(self, t: float, view: Mapping[str, Any]) -> None:
-        self._recording = encode({"type": "recording", "t": t, **view})
+        self._kept["recording"] = encode({"type": "recording", "t": t, **view})
         self._actions = frozenset(view["actions"])
         for page in self.pages.values():
-            page.queue.put_newest("recording", self._recording)
+            page.queue.put_newest("recording", self._kept["recording"])
 
-    def _waiting_message(self) -> str:
-        return encode({"type": "pad", "waiting": self._waiting_for})
+    def _keep(self, message: dict[str, Any]) -> None:
+        self._kept[message["type"]] = self._send_all(message)
 
     def _refuse(self, page: WebPage, why: str) -> None:
         page.queue.put_note(encode({"type": "refused", "why": why}))
 
     def _send_all(self, message: dict[str, Any]) -> str:
         text = encode(message)
-        self._send_text_to_all(text)
-        return text
-
-    def _send_text_to_all(self, text: str) -> None:
         for page in self.pages.values():
             page.queue.put_note(text)
+        return text
 
     def send_state(self, state: dict[str, Any]) -> None:
         """Send the state of the rig to every page; a page that is slow gets the newest one only."""

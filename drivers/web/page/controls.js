@@ -153,7 +153,11 @@ export class Controls {
     this.home = byId("home");
     this.slider = new Slider(byId("gripper"), enabled, () => pad.grip, (place) => pad.setGrip(place));
     /** @type {(() => void)[]} */
-    const forget = [this.slider.forget, this.#wireHold(), this.#wireHome()];
+    const forget = [
+      this.slider.forget,
+      this.#wire(this.hold, enabled, (on) => pad.hold("page", on)),
+      this.#wire(this.home, () => enabled() && pad.held, (on) => pad.goHome("page", on)),
+    ];
     /** @type {[Disc, number, number][]} */
     this.discs = [];
     for (const element of this.#all("[data-disc]")) forget.push(this.#wireDisc(element));
@@ -173,18 +177,9 @@ export class Controls {
     return document.querySelectorAll(selector);
   }
 
-  #wireHold() {
-    return onPress(this.hold, {
-      down: () => (this.enabled() ? this.pad.hold("page", true) : false),
-      up: () => this.pad.hold("page", false),
-    });
-  }
-
-  #wireHome() {
-    return onPress(this.home, {
-      down: () => (this.enabled() && this.pad.held ? this.pad.goHome("page", true) : false),
-      up: () => this.pad.goHome("page", false),
-    });
+  /** @param {HTMLElement} element @param {() => boolean} may @param {(on: boolean) => void} press */
+  #wire(element, may, press) {
+    return onPress(element, { down: () => (may() ? press(true) : false), up: () => press(false) });
   }
 
   /** @param {HTMLElement} element */
@@ -209,7 +204,7 @@ export class Controls {
       this.pad.update();
     };
     this.buttons.push([element, BIT[name]]);
-    return onPress(element, { down: () => (this.enabled() ? press(true) : false), up: () => press(false) });
+    return this.#wire(element, this.enabled, press);
   }
 
   /** Label every control with what it does. @param {any} labels */

@@ -84,7 +84,7 @@ def test_a_page_that_opens_gets_everything_in_order(room: Room) -> None:
         room.session.receive_from_app({"method": "say", "t": float(k), "text": f"word {k}"})
     room.session.receive_from_app({"method": "waiting", "controls": ["r2"]})
     told = inbox(room.page())
-    hello, labels, lease, pad, *says = told
+    hello, lease, labels, pad, *says = told
     assert (hello["type"], hello["page"], hello["name"], hello["rig"]) == ("hello", 2, "page 2", RIG)
     assert labels == {"type": "labels", "deadman": "l2", "controls": {}}
     assert lease == {"type": "lease", "driver": "page 1", "you": False, "t": 100.0, "why": ""}
