@@ -57,7 +57,7 @@ _FLAG_FAULTS: dict[int, tuple[str, str, str]] = {
     protocol.LOW_VOLTAGE: ("low_voltage", "has too low a voltage", "check the power supply, its plugs and its cables"),
     protocol.COLLISION: ("collision", "has met an obstacle: collision protection", _LOOK),
     protocol.STALLED: ("stalled", "is blocked: stall protection", _LOOK),
-    protocol.ERROR: ("joint_error", "reports an error", f"if robot.recover() does not help, {_SUPPORT}"),
+    protocol.ERROR: ("joint_error", "reports an error", f"if recovering does not help, {_SUPPORT}"),
 }
 """Flag of a motor -> code, what the joint does, remedy; the most telling first."""
 _CONTROL = {0: "standby", 2: "teaching", 3: "Ethernet", 4: "Wi-Fi", 5: "remote control", 6: "leader", 7: "trajectory"}

@@ -7,6 +7,7 @@ which never makes the app wait.
 from __future__ import annotations
 
 import contextlib
+import re
 import secrets
 import sys
 import threading
@@ -150,7 +151,7 @@ class WebConsole(Console):
     # What pages show.
 
     def say(self, text: str) -> None:
-        self._channel.send("say", t=time.monotonic(), text=text)
+        self._channel.send("say", t=time.monotonic(), text=name_buttons(text))
 
     def explain(self, labels: Mapping[str, Any]) -> None:
         self.deadman = str(labels["deadman"])
@@ -262,7 +263,7 @@ class WebConsole(Console):
             raise  # printed by the channel
 
     def _refuse(self, page: str, why: str) -> None:
-        self._channel.send("refused", page=page, why=why)
+        self._channel.send("refused", page=page, why=name_buttons(why))
 
     def _pad(self) -> Gamepad | None:
         pads = [pad for pad in self.rig.gamepads.values() if isinstance(pad.driver, WebPad)]
@@ -436,6 +437,11 @@ def _group_message(spec: GroupSpec) -> dict[str, Any]:
         "grippers": [gripper.name for gripper in spec.grippers],
         "gripper_of": {robot.name: robot.gripper.name for robot in spec.robots if robot.gripper is not None},
     }
+
+
+def name_buttons(text: str) -> str:
+    """Return a text for pages, whose button does what a program calls ``robot.recover()`` for."""
+    return re.sub(r"(call )?robot\.recover\(\)", 'press "Recover"', text)
 
 
 def recording_message(view: RecordingView) -> dict[str, Any]:
