@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import json
 import math
 import tempfile
 import xml.etree.ElementTree as ElementTree
@@ -19,7 +21,7 @@ from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Transform, compose, inverse
 from hal.kinematics.hulls import Hull, convex_hull, uniform_solid
-from hal.kinematics.mesh_files import mesh_file, mesh_near
+from hal.kinematics.mesh_files import cache_file, mesh_file, mesh_near, write_whole
 from hal.kinematics.urdf import UrdfMimic, UrdfModel, UrdfVisual, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
@@ -28,6 +30,8 @@ from .motors import PassiveJoints
 
 MARGIN, THIN = 0.001, 0.2
 """Margin that PyBullet adds around hulls, m; and what is taken off a thin hull at most, as a share of its thickness."""
+_TIGHT = 1
+"""Version of the cached hulls; increase it whenever they change."""
 SLIVER = 1e-6
 """Area of a face, as a share of the greatest, below which it is left out: its normal is a matter of chance."""
 LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
@@ -146,20 +150,35 @@ def _tighten(link: ElementTree.Element, shapes: Sequence[UrdfVisual], place: Pat
         if shape.shape != "mesh":
             continue
         link.remove(collision)
-        for points in mesh_points(shape, sliced=True):
+        for text in _tight_hulls(shape):
             file = place / f"{link.get('name')}_{len(link)}.obj"
-            _write_hull(convex_hull(points), file)
+            file.write_text(text)
             part = copy.deepcopy(collision)
             for mesh in part.iter("mesh"):
                 mesh.attrib = {"filename": str(file)}
             link.append(part)
 
 
-def _write_hull(hull: Hull, file: Path) -> None:
-    """Write an OBJ file of a hull that is smaller by PyBullet's margin."""
+def _tight_hulls(shape: UrdfVisual) -> list[str]:
+    """Return the OBJ files of a mesh's hulls, smaller by PyBullet's margin; from the user's cache if it has them.
+
+    They take seconds for some arms. A cache that is missing, broken or not writable only costs that time.
+    """
+    cached = cache_file("hulls", Path(shape.file), _TIGHT, shape.size, suffix=".json")
+    with contextlib.suppress(OSError, ValueError):
+        found: list[str] = json.loads(cached.read_bytes())
+        return found
+    made = [_tighten_hull(convex_hull(points)) for points in mesh_points(shape, sliced=True)]
+    with contextlib.suppress(OSError):
+        write_whole(cached, json.dumps(made).encode())
+    return made
+
+
+def _tighten_hull(hull: Hull) -> str:
+    """Return the OBJ file of a hull that is smaller by PyBullet's margin."""
     smaller = remove_margin(hull)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in smaller.points]
-    file.write_text("".join(lines + [f"f {a} {b} {c}\n" for a, b, c in smaller.faces + 1]))
+    return "".join(lines + [f"f {a} {b} {c}\n" for a, b, c in smaller.faces + 1])
 
 
 def _load_urdf(
@@ -214,7 +233,7 @@ def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str) -> int:
     with tempfile.TemporaryDirectory() as place:
         parts = []
         for k, hull in enumerate(hulls if spec.collision else ()):
-            _write_hull(hull, Path(place) / f"{k}.obj")
+            Path(place, f"{k}.obj").write_text(_tighten_hull(hull))
             parts.append(f'<collision><geometry><mesh filename="{k}.obj"/></geometry></collision>')
         if free:
             solid = uniform_solid(hulls)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import os
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hal.kinematics.mesh_files import cache_folder, write_whole
 
 from .shapes import Mesh, joined, unit
 
@@ -47,17 +49,11 @@ _COARSE_SHARE = 1 / 25
 """The same two limits for small pictures."""
 
 
-def cache_folder() -> Path:
-    """Return ``$XDG_CACHE_HOME/robot-hal/meshes``, by default under ``~/.cache``."""
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(root) / "robot-hal" / "meshes"
-
-
 class MeshLibrary:
     """Meshes by file, from memory, from the cache folder or parsed, in this order."""
 
     def __init__(self, folder: Path | None = None, parser: Callable[[str], list[Mesh]] | None = None) -> None:
-        self._folder = cache_folder() if folder is None else folder
+        self._folder = cache_folder("meshes") if folder is None else folder
         self._parser = parser or parse
         self._known: dict[str, list[Mesh]] = {}
 
@@ -101,7 +97,6 @@ def _key(path: str) -> str:
 
 
 def _write(path: Path, meshes: list[Mesh]) -> None:
-    """Write into a temporary file first, so that half a file is never read."""
     arrays: dict[str, Any] = {"count": np.array(len(meshes))}
     for index, mesh in enumerate(meshes):
         for name, level in ((f"{index}", mesh), (f"{index}.coarse", mesh.coarse)):
@@ -109,15 +104,9 @@ def _write(path: Path, meshes: list[Mesh]) -> None:
                 value = getattr(level, field)
                 if value is not None:
                     arrays[f"{name}.{field}"] = np.asarray(value)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    data = io.BytesIO()
+    np.savez(data, **arrays)
+    write_whole(path, data.getvalue())
 
 
 def _read(path: Path) -> list[Mesh]:

@@ -6,7 +6,6 @@ What is made is kept in the user's cache, named by its contents, because every p
 from __future__ import annotations
 
 import hashlib
-import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from math import atan2, hypot
 from pathlib import Path
 
 from ..geometry import Pose
-from .mesh_files import PACKAGE, mesh_file
+from .mesh_files import PACKAGE, cache_folder, mesh_file, write_whole
 from .urdf import UrdfModel, parse_xml
 
 PREFIX = "tool_"
@@ -101,19 +100,10 @@ def _keep(root: ElementTree.Element, stem: str) -> Path:
 
 def keep_urdf(data: bytes, stem: str) -> Path:
     """Write a URDF into the cache, unless it is there, and return its path; ``stem`` begins its name."""
-    place = _cache_folder() / f"{stem}-{hashlib.sha256(data).hexdigest()[:16]}.urdf"
+    place = cache_folder("urdf") / f"{stem}-{hashlib.sha256(data).hexdigest()[:16]}.urdf"
     if not place.is_file() or place.read_bytes() != data:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = place.with_name(f"{place.name}.{os.getpid()}")
-        unfinished.write_bytes(data)
-        os.replace(unfinished, place)
+        write_whole(place, data)
     return place
-
-
-def _cache_folder() -> Path:
-    """Return ``$XDG_CACHE_HOME/robot-hal/urdf``, by default under ``~/.cache``."""
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(root, "robot-hal", "urdf")
 
 
 def _parse_with_absolute_files(urdf: Path) -> ElementTree.Element:

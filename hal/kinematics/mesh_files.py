@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import importlib.metadata
 import importlib.util
+import io
 import os
 import re
 import struct
@@ -199,10 +200,7 @@ def hull_points(path: Path) -> NDArray[np.float64]:
         RuntimeError: coal cannot read it, or it has no volume.
         OSError: It cannot be read.
     """
-    state = path.stat()
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    key = hashlib.sha256(f"1 {path.resolve()} {state.st_mtime_ns} {state.st_size}".encode()).hexdigest()
-    cached = Path(root) / "robot-hal" / "hulls" / f"{key}.npy"
+    cached = cache_file("hulls", path, 1, suffix=".npy")
     with contextlib.suppress(OSError, ValueError, EOFError):
         known: NDArray[np.float64] = np.load(cached)
         if known.ndim == 2 and known.shape[1] == 3 and np.isfinite(known).all():
@@ -213,9 +211,32 @@ def hull_points(path: Path) -> NDArray[np.float64]:
     mesh = coal.MeshLoader().load(str(path))
     mesh.buildConvexHull(True, "Qt")
     points: NDArray[np.float64] = np.array(mesh.convex.points(), float).reshape(-1, 3)
+    data = io.BytesIO()
+    np.save(data, points)
     with contextlib.suppress(OSError):
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        part = cached.with_suffix(f".{os.getpid()}.npy")
-        np.save(part, points)
-        part.replace(cached)
+        write_whole(cached, data.getvalue())
     return points
+
+
+def cache_folder(name: str) -> Path:
+    """Return ``$XDG_CACHE_HOME/robot-hal/NAME``, by default under ``~/.cache``."""
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(root, "robot-hal", name)
+
+
+def cache_file(folder: str, file: Path, *what: object, suffix: str) -> Path:
+    """Return where to keep what was computed from a file and from ``what``; another place once the file changes.
+
+    Raises OSError if there is no such file.
+    """
+    state = file.stat()
+    text = " ".join(map(str, (file.resolve(), state.st_mtime_ns, state.st_size, *what)))
+    return cache_folder(folder) / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}{suffix}"
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file, and its folder if there is none, so that nobody reads half of it. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}")
+    unfinished.write_bytes(data)
+    unfinished.replace(path)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from specs import box, cube, data, floor, iiwa, panda, world_spec
 
+import hal
 from hal.drivers.pybullet.world import PyBulletWorld
 from hal.geometry import Pose
 from hal.specs import BodySpec
@@ -52,3 +55,19 @@ def test_free_fall() -> None:
 def test_a_rate_at_which_contacts_give_way_is_a_warning() -> None:
     for rate, count in ((60.0, 1), (240.0, 0)):
         assert len(PyBulletWorld(world_spec(floor(), physics_hz=rate)).warnings) == count
+
+
+def test_hulls_are_kept_for_the_next_start_and_made_anew_if_they_are_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    made = []
+    for _ in range(2):
+        with hal.open("ur5e_robotiq", sim=True, pad="none", clock="lock_step", overrides=["cameras={}"]) as rig:
+            assert rig.robots["arm"].gripper is not None
+        kept = sorted(tmp_path.glob("robot-hal/hulls/*.json"))
+        made.append({file: file.read_bytes() for file in kept})
+        for file in kept:
+            file.write_bytes(file.read_bytes()[:100])
+    assert made[0]
+    assert made[0] == made[1]

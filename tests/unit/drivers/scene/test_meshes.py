@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from pictures_kit import COLLADA
 
-from hal.drivers.scene.meshes import MeshLibrary, cache_folder, parse, simplify_mesh
+from hal.drivers.scene.meshes import MeshLibrary, parse, simplify_mesh
 from hal.drivers.scene.shapes import Mesh, box, capsule, cylinder, sphere
+from hal.kinematics.mesh_files import cache_folder
 
 CUBE = """\
 mtllib cube.mtl
@@ -119,10 +120,10 @@ def test_cache_that_cannot_be_written_is_ignored(cube: Path, tmp_path: Path) -> 
 
 def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / "robot-hal" / "meshes"
+    assert cache_folder("meshes") == tmp_path / "robot-hal" / "meshes"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / ".cache" / "robot-hal" / "meshes"
+    assert cache_folder("meshes") == tmp_path / ".cache" / "robot-hal" / "meshes"
 
 
 def test_broken_files_are_left_out_with_a_warning(tmp_path: Path) -> None:
