@@ -25,6 +25,9 @@ POSES = {
     "viperx": ([0.3, -0.4, 0.2, 0.3, -1.0, 0.4], [-0.4, 0.2, -0.5, -0.3, -1.3, -0.4], [0.0, -0.18, -0.36, 0, -1.38, 0]),
 }
 """The last one is where the arm starts."""
+SOAK = bool(os.environ.get("HAL_SOAK"))
+if SOAK:
+    POSES["widowx"] = POSES["viperx"]
 APP = """
 import json, sys, hal
 if __name__ == "__main__":
@@ -55,7 +58,7 @@ def tour(rig: hal.Rig, poses: Sequence[list[float]]) -> list[hal.RobotState]:
     return found
 
 
-@pytest.mark.parametrize("run", range(10 if os.environ.get("HAL_SOAK") else 1))
+@pytest.mark.parametrize("run", range(10 if SOAK else 1))
 def test_the_tour_ends_at_the_poses_of_the_simulation_and_the_arm_holds_afterwards(
     emulator: ServoBusProcess, run: int
 ) -> None:

@@ -138,6 +138,7 @@ def test_goals_are_the_present_positions_before_the_torque_is_on_and_nothing_lea
     assert max(arm.far.arm.peak) < 0.3, "rad/s: its load bends the motors' springs, until the goals lead"
 
 
+@pytest.mark.parametrize("arm", ["so101", "viperx", "widowx"], indirect=True)
 def test_a_load_does_not_pull_it_off_its_set_point(arm: Arm) -> None:
     goal = list(arm.engage().q)
     for _ in range(100):

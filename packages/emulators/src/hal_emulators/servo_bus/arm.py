@@ -83,7 +83,7 @@ class EmulatedArm:
             closed = 2000 if own.widths is None else round(own.zero + table[0][0] / COUNT)
             ends = (closed, closed + round(self._ways[-1] / COUNT))
             self._jaw_servo = kind(own.id, 77, ends, 1, closed)
-            self._jaw_servo.become(0.0, own.id)
+            self._jaw_servo.become(torques[-1], own.id)  # as that of the last joint
             self.servos.append(self._jaw_servo)
             self.jaw = GripperPlant(_find_mechanics([self._jaw_servo]), 0.5 * self._ways[-1], 0.0, self._ways[-1])
         self.world: ArmInWorld | None = None

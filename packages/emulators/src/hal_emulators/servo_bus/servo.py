@@ -63,7 +63,7 @@ class Servo:
         """Set the registers that keep their values, as delivered."""
 
     def become(self, torque: float, leader: int) -> None:
-        """Be a model with about this torque, Nm, 0 for a small one, that follows another motor if it is not its own."""
+        """Be a model with about this torque, Nm, that follows another motor if it is not its own."""
 
     def decode(self) -> Registers:
         """Return what it has stored."""
@@ -248,7 +248,7 @@ class DynamixelServo(Servo):
             self.put(address, value)
 
     def become(self, torque: float, leader: int) -> None:
-        known = {number: MODELS[number].stall_torque for number in (1020, 1120)}
+        known = {number: MODELS[number].stall_torque for number in (1020, 1060, 1120)}
         self.put(0, min(known, key=lambda number: abs(known[number] - torque)))
         self.put(12, 255 if leader == self.id else leader)
 
