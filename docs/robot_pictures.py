@@ -32,7 +32,7 @@ from benchmarks.robots import entries
 FOLDER = Path(__file__).resolve().parent / "images" / "robots"
 SIZE, SHARP, COLORS = 260, 3, 64
 """Side of a picture, pixels; it is drawn larger by a factor and then scaled down; colours of its palette."""
-SMALL, LABEL, COLUMNS = 150, 12, 9
+SMALL, LABEL, COLUMNS = 150, 12, 10
 """Side of a picture on the sheet, height of its label, pixels; columns."""
 FIELD_DEG, MARGIN = 30.0, 1.12
 """Field of view; room around the arm."""
