@@ -59,7 +59,7 @@ class ServoBus:
         self._status: dict[int, bytes] = {}
         """The newest :attr:`ServoProtocol.status` of each motor."""
         self._missing: set[int] = set()
-        """Motors whose last answer was lost."""
+        """Motors whose answer to the last question that was not answered was lost."""
         self._turn = 0
         """Number of motors whose status was asked for in turn."""
         self.opened = 0
@@ -69,8 +69,12 @@ class ServoBus:
         self._users = 0
         self._seen: set[object] = set()
         """Who has the newest states."""
-        self._wait = False
-        """Whether answers were missing: the next cycle lets late ones pass, so that none counts as a newer one."""
+        self._asked, self._t_asked = protocol.state, 0.0
+        """What was asked for last, and the time of the cycle in which the states were, s."""
+        self._owed: set[int] = set()
+        """Motors that have not answered that yet."""
+        self._answers: dict[int, tuple[float, Answer]] = {}
+        """Time and state of motors, until their status is known."""
         self._t_tried = 0.0
         self.reset_statistics()
 
@@ -119,10 +123,10 @@ class ServoBus:
         except OSError as error:
             self._lose(error)
         else:
-            self.fault, self._wait = None, False
+            self.fault = None
             self.opened += 1
-            self.states.clear()
-            self._status.clear()
+            for known in (self._owed, self._answers, self.states, self._status):
+                known.clear()
 
     def _close(self) -> None:
         line, self._line = self._line, None
@@ -206,10 +210,12 @@ class ServoBus:
                 end, linger = monotonic() + linger, 1e-9
         return found
 
-    def _drain(self) -> None:
-        """Drop what has come too late, or twice."""
+    def _drain(self) -> list[Answer]:
+        """Return what has come too late, or twice."""
         with self._use_line() as line:
-            self.surplus += len(self.protocol.split(read_line(line))[0])
+            answers = self.protocol.split(read_line(line))[0]
+        self.surplus += len(answers)
+        return answers
 
     def read(self, id: int, address: int, size: int) -> bytes | None:
         """Return registers of a motor; None if it does not answer. Raises ConnectionLost."""
@@ -236,31 +242,49 @@ class ServoBus:
             self._seen.add(user)
             return
         self._seen = {user}
-        if self._wait:
-            self._wait = False
-            self._drain()
-            return
-        end = monotonic() + _ANSWER
-        answers = self.read_all(self.protocol.state, self.ids, end)
-        self.cycles += 1
-        missing = {*self.ids} - {*answers}
-        for id in missing & self._missing:  # it may have lost its power; one answer is lost now and then
-            self._status.pop(id, None)
-        self._missing = missing
-        if self.protocol.status is not None and not self._wait:
-            new = self.read_all(self.protocol.status, self._choose(answers), end)
-            self._status.update((id, answer.data) for id, answer in new.items())
-        for id, answer in answers.items():
-            if self.protocol.status is None or id in self._status:
-                self.states[id] = self.protocol.decode_state(now, answer, self._status.get(id, b""))
+        self._converse(now)
+        for id in [id for id in self._answers if self.protocol.status is None or id in self._status]:
+            self.states[id] = self.protocol.decode_state(*self._answers.pop(id), self._status.get(id, b""))
 
-    def _choose(self, answers: Mapping[int, Answer]) -> list[int]:
+    def _converse(self, now: float) -> None:
+        """Take late answers as what they are, as old as their question; then ask for states and for status.
+
+        Where an answer is lost nothing is asked in this cycle, so that one that comes still later is no newer one's.
+        """
+        state, status, end = self.protocol.state, self.protocol.status, monotonic() + _ANSWER
+        late = self._asked if self._owed else None
+        if self._owed:
+            self._note({answer.id: answer for answer in self._drain() if answer.id in self._owed})
+            lost, self._owed = self._owed, set()
+            for id in lost & self._missing:  # it may have lost its power; one answer is lost now and then
+                self._status.pop(id, None)
+            self._missing = lost
+            if lost:
+                return
+        if late != state or status is None:
+            self._t_asked = now
+            self.cycles += 1
+            self._note(self.read_all(state, self.ids, end))
+        if status is not None and not self._owed:
+            self._missing = set()
+            self._note(self.read_all(status, self._choose(), end))
+
+    def _note(self, answers: Mapping[int, Answer]) -> None:
+        """Note what motors answer to the last question."""
+        found = {id: answer for id, answer in answers.items() if len(answer.data) == self._asked[1]}
+        self._owed -= {*found}
+        if self._asked == self.protocol.state:
+            self._answers.update((id, (self._t_asked, answer)) for id, answer in found.items())
+        else:
+            self._status.update((id, answer.data) for id, answer in found.items())
+
+    def _choose(self) -> list[int]:
         """Return the motors whose status is read now: two that are new or report an error, and two in turn.
 
         That of all motors, which are new after two cycles without an answer, would take longer than a cycle waits.
         """
-        new = [id for id in answers if id not in self._status]
-        urgent = [*new, *(id for id, answer in answers.items() if answer.error)][:2]
+        new = [id for id in self._answers if id not in self._status]
+        urgent = [*new, *(id for id, (_, answer) in self._answers.items() if answer.error)][:2]
         self._turn += 2
         return sorted({*urgent, *(self.ids[k % len(self.ids)] for k in (self._turn, self._turn + 1))})
 
@@ -273,7 +297,7 @@ class ServoBus:
         address, size = block
         asked = self.protocol.place(address, size) + bytes(ids)
         found = self.ask(ALL, SYNC_READ, asked, ids, end - monotonic())
-        self._wait = len(found) < len(ids)
+        self._asked, self._owed = block, {*ids} - {*found}
         self.lost += len(ids) - len(found)
         return {id: answer for id, answer in found.items() if len(answer.data) == size}
 

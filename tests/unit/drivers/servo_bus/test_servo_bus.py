@@ -304,6 +304,25 @@ def test_an_arm_answers_in_time_after_cycles_in_which_no_motor_did(viperx: Arm, 
     assert 0.003 < max(took) < 0.007
 
 
+def test_late_answers_are_of_the_time_of_their_question_and_keep_the_arm_going(
+    arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goal = list(arm.engage().q)
+    monkeypatch.setattr(bus, "_ANSWER", 0.002)
+    arm.far.execute("late 0.01")
+    ages = []
+    for _ in range(20):
+        goal[0] += 0.003
+        ages.append(arm.now + 0.01 - arm.write(goal).t)
+        sleep(0.03)  # all answers have come before the next cycle
+    assert arm.driver.engaged
+    ahead = 1 if arm.far.spec.model == "so101" else 2  # cycles; a ViperX is also asked for its status
+    assert 0.009 < min(ages) < max(ages[1:]) < 0.011 + 0.01 * ahead
+    arm.far.execute("error 3 32")
+    faults = [arm.run().fault for _ in range(12) if sleep(0.03) is None]
+    assert "overload" in [fault.code for fault in faults if fault is not None], "the status is read, too"
+
+
 def test_a_silent_motor_is_lost_after_a_tenth_of_a_second_and_comes_back(
     arm: Arm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
