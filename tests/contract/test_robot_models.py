@@ -20,7 +20,7 @@ from hal.testing import RobotBench, RobotContract
 robots = load_benchmark("robots")
 pytestmark = pytest.mark.slow
 ENTRIES = [entry for model in list_data("robots") for entry in robots.entries(model)]
-WITHOUT_TORQUES = ("so101", "xarm7")
+WITHOUT_TORQUES = ("so101", "wx250s", "xarm7")
 SLOW = ("jaco",)
 """Their joints are slower than the motion of a check."""
 
@@ -88,7 +88,7 @@ class TestModels(Models):
 @of_models(*WITHOUT_TORQUES)
 class TestModelsWithoutTorques(
     Models,
-    left_out={"torque": "1 Nm throws an SO-101, and the damping in the URDF of the xArm7 takes most of it"},
+    left_out={"torque": "1 Nm throws small arms, and the damping in the URDF of the xArm7 takes most of it"},
 ):
     pass
 
