@@ -169,7 +169,9 @@ class ServoArm(RobotDriver):
                 self._fault = fault
                 self.faults += 1
                 self._disengage()
-                self._stay(states)
+                # Joints that are away from their goals stay where they are: they neither push on nor leap.
+                goals = [s.position if abs(s.goal - s.position) * COUNT > _AWAY else s.goal for s in states]
+                self.chain.write_goals(self._clip(goals))
             elif any(state.stopped for state in states):  # this process was frozen: they are switched on anew
                 self._disengage()
         return self._fault or fault
@@ -180,11 +182,6 @@ class ServoArm(RobotDriver):
     def _disengage(self) -> None:
         self.engaged, self._t_last_try = False, -inf
         self._following.forget()
-
-    def _stay(self, states: Sequence[MotorState]) -> None:
-        """Tell joints that are away from their goals to stay where they are: they neither push on nor leap."""
-        goals = [s.position if abs(s.goal - s.position) * COUNT > _AWAY else s.goal for s in states]
-        self.chain.write_goals(self._clip(goals))
 
     def _clip(self, counts: Sequence[float]) -> list[int]:
         """Return goals that the motors take: within their calibrated ranges, which they keep by themselves, too."""

@@ -59,7 +59,7 @@ class ServoBus:
         self._status: dict[int, bytes] = {}
         """The newest :attr:`ServoProtocol.status` of each motor."""
         self._missing: set[int] = set()
-        """Motors whose answer to the last question that was not answered was lost."""
+        """Motors whose last answer was lost."""
         self._turn = 0
         """Number of motors whose status was asked for in turn."""
         self.opened = 0
@@ -242,14 +242,14 @@ class ServoBus:
             self._seen.add(user)
             return
         self._seen = {user}
-        self._converse(now)
+        self._read_motors(now)
         for id in [id for id in self._answers if self.protocol.status is None or id in self._status]:
             self.states[id] = self.protocol.decode_state(*self._answers.pop(id), self._status.get(id, b""))
 
-    def _converse(self, now: float) -> None:
-        """Take late answers as what they are, as old as their question; then ask for states and for status.
+    def _read_motors(self, now: float) -> None:
+        """Take the late answers to the last question, which are as old as that; then ask for states and for status.
 
-        Where an answer is lost nothing is asked in this cycle, so that one that comes still later is no newer one's.
+        If an answer is lost, nothing is asked in this cycle: it may come even later, and must not count as a newer one.
         """
         state, status, end = self.protocol.state, self.protocol.status, monotonic() + _ANSWER
         late = self._asked if self._owed else None
@@ -270,7 +270,7 @@ class ServoBus:
             self._note(self.read_all(status, self._choose(), end))
 
     def _note(self, answers: Mapping[int, Answer]) -> None:
-        """Note what motors answer to the last question."""
+        """Store the answers to the last question."""
         found = {id: answer for id, answer in answers.items() if len(answer.data) == self._asked[1]}
         self._owed -= {*found}
         if self._asked == self.protocol.state:

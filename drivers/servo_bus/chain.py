@@ -278,10 +278,6 @@ class Chain:
         values = {id: goal.to_bytes(size, "little", signed=True) for id, goal in self._count_goals(goals).items()}
         self.write(address, values)
 
-    def write_limit(self, limit: int) -> None:
-        """Send the torque limit of all motors."""
-        self.write(self.protocol.limit, dict.fromkeys(self.ids, limit.to_bytes(2, "little")))
-
     def prepare(self, goals: Sequence[int], limits: Sequence[int]) -> None:
         """Give motors that are off their goals, counts, and torque limits, and take away their profile.
 

@@ -104,7 +104,8 @@ class ServoGripper(GripperDriver):
                 self._fault, self._goal = fault, self._ramp
             else:
                 self._drive(state, width, dt)
-        moving = self._is_driven() and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
+        driven = self._target is not None and self._fault is None
+        moving = driven and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
         torque = abs(state.load) / self.protocol.full * self.chain.registers[0].stall_torque if state.on else 0.0
         blocked = width - self._goal > _TOLERANCE
         return GripperReading(
@@ -118,9 +119,6 @@ class ServoGripper(GripperDriver):
             force=torque / self._lever(width),
             fault=self._fault,
         )
-
-    def _is_driven(self) -> bool:
-        return self._target is not None and self._fault is None
 
     def _drive(self, state: MotorState, width: float, dt: float) -> None:
         """Switch the motor on where it is, then move its goal along at the speed of the command."""
@@ -143,7 +141,7 @@ class ServoGripper(GripperDriver):
 
     def _send(self, state: MotorState, width: float) -> None:
         if state.torque_limit != self._limit:
-            self.chain.write_limit(self._limit)
+            self.chain.write(self.protocol.limit, {self.settings.id: self._limit.to_bytes(2, "little")})
         self.chain.write_goals([self._count(width)])
 
     def move(self, width: float, speed: float, force: float) -> None:

@@ -54,11 +54,8 @@ def check_leader(spec: PadSpec) -> Iterator[tuple[str, str, str]]:
     if settings.lever is None and spec.leader.lever != "none":
         yield "options.lever", "is missing: the id of its motor; or set lever: none", "missing_key"
     if spec.leader.feedback and PROTOCOLS[spec.driver].name != "Dynamixel":
-        yield (
-            "feedback",
-            f"a {PROTOCOLS[spec.driver].name} motor has no small torques: a Dynamixel leader has",
-            "unsupported",
-        )
+        message = f"a {PROTOCOLS[spec.driver].name} motor has no small torques: a Dynamixel leader has"
+        yield "feedback", message, "unsupported"
     motors = len(settings.ids) + (settings.lever is not None)
     yield from (("options.baud", *problem) for problem in check_baud(spec.driver, motors, settings.baud))
 
@@ -125,10 +122,8 @@ class ServoLeader(LeaderDriver):
             self._opened, self._closed = COUNT * stored[-1].range_max, COUNT * stored[-1].range_min
         span = abs(self._opened - self._closed)
         if own.lever is not None and not 0.0 < span < _WIDEST:
-            text = (
-                f"the lever (motor {own.lever}): its range is {span:.2f} rad; calibrate it, or give options.lever_deg"
-            )
-            raise ConnectionLost(text, code="not_calibrated")
+            text = f"the lever (motor {own.lever}): its range is {span:.2f} rad; calibrate it, or give "
+            raise ConnectionLost(f"{text}options.lever_deg", code="not_calibrated")
 
     def _pulled(self, angle: float) -> float:
         middle = 0.5 * (self._opened + self._closed)
