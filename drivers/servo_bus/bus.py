@@ -24,6 +24,8 @@ from .settings import ANSWER as _ANSWER
 
 _OPENING = 0.02
 """Longest time to wait for an answer while a device is opened, s."""
+_AWAY = 0.08
+"""Silence after which a motor may have lost its power, s: a motor that restarts takes longer."""
 _PATIENCE = 2.0
 """Longest time to wait for another program to release the port, s."""
 _RETRY = 0.25
@@ -58,8 +60,6 @@ class ServoBus:
         self.states: dict[int, MotorState] = {}
         self._status: dict[int, bytes] = {}
         """The newest :attr:`ServoProtocol.status` of each motor."""
-        self._missing: set[int] = set()
-        """Motors whose last answer was lost."""
         self._turn = 0
         """Number of motors whose status was asked for in turn."""
         self.opened = 0
@@ -256,9 +256,9 @@ class ServoBus:
         if self._owed:
             self._note({answer.id: answer for answer in self._drain() if answer.id in self._owed})
             lost, self._owed = self._owed, set()
-            for id in lost & self._missing:  # it may have lost its power; one answer is lost now and then
-                self._status.pop(id, None)
-            self._missing = lost
+            for id in lost:
+                if id in self.states and now - self.states[id].t > _AWAY:
+                    self._status.pop(id, None)
             if lost:
                 return
         if late != state or status is None:
@@ -266,7 +266,6 @@ class ServoBus:
             self.cycles += 1
             self._note(self.read_all(state, self.ids, end))
         if status is not None and not self._owed:
-            self._missing = set()
             self._note(self.read_all(status, self._choose(), end))
 
     def _note(self, answers: Mapping[int, Answer]) -> None:
@@ -281,7 +280,7 @@ class ServoBus:
     def _choose(self) -> list[int]:
         """Return the motors whose status is read now: two that are new or report an error, and two in turn.
 
-        That of all motors, which are new after two cycles without an answer, would take longer than a cycle waits.
+        That of all motors, which are new after a silence, would take longer than a cycle waits.
         """
         new = [id for id in self._answers if id not in self._status]
         urgent = [*new, *(id for id, (_, answer) in self._answers.items() if answer.error)][:2]

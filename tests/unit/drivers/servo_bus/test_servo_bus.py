@@ -287,21 +287,23 @@ def test_single_bad_answers_are_counted_and_stop_nothing(
     assert arm.run(0.2).q == pytest.approx(goal, abs=0.01)
 
 
-@pytest.mark.parametrize(("cycles", "again"), [(1, 2), (2, 4)])
-def test_an_arm_answers_in_time_after_cycles_in_which_no_motor_did(viperx: Arm, cycles: int, again: int) -> None:
+def test_an_arm_answers_in_time_after_cycles_in_which_no_motor_did(viperx: Arm) -> None:
     """On the wire of a real one; the status of all motors at once would take longer than a cycle waits."""
     viperx.engage()
-    viperx.far.execute(f"lose next {8 * cycles}")
+    viperx.far.execute(f"lose next {8 * 4}")
     with patch.object(bus, "_ANSWER", 0.05):
-        viperx.run(0.02 * cycles)  # late answers pass in each second cycle
+        viperx.run(0.08)  # late answers pass in each second cycle
+    assert viperx.run().t == viperx.now, "all joints are new again"
+    assert viperx.driver.chain.bus is not None
+    viperx.driver.chain.bus._status.clear()  # as after a longer silence
     protocol, took = viperx.driver.protocol, []
     with patch.object(ServoBus, "read_all", autospec=True, side_effect=ServoBus.read_all) as asked:
-        for _ in range(again):
+        for _ in range(4):
             asked.reset_mock()
             reading = viperx.run()
             sizes = [len(protocol.encode_answer(1, 0, bytes(c.args[1][1]))) * len(c.args[2]) for c in asked.mock_calls]
             took.append(10.0 * sum(sizes) / viperx.driver.settings.baud)
-    assert reading.t == viperx.now, "all joints are new again"
+    assert reading.t == viperx.now
     assert 0.003 < max(took) < 0.007
 
 
