@@ -55,7 +55,7 @@ def play(t: float) -> dict[str, list[float]]:
 
 
 def test_each_hand_drives_its_arm_and_releasing_one_leaves_the_other(tmp_path: Path) -> None:
-    page, seen = Page(), {}
+    page, seen, held = Page(), {}, {}
     with hal.open(RIG, sim=True, clock="lock_step", pad="none") as rig, Recorder(rig, tmp_path, fps=50) as recorder:
         specs = [
             PadSpec(name, "web", None, drives=name, options={} if side == "any" else {"hand": side})
@@ -71,6 +71,7 @@ def test_each_hand_drives_its_arm_and_releasing_one_leaves_the_other(tmp_path: P
             page.send(now, play(now - start))
             for pad in pads:
                 pad.poll_once(now)
+            held[now - start] = [arm.deadman.held for arm in session.arms]
             seen[now - start] = np.array([arm.state().tcp.position for arm in rig.robots.values()])
 
         session = hal.TeleopSession(rig, list(rig.robots.values()), pads, on_tick=poll)
@@ -78,6 +79,8 @@ def test_each_hand_drives_its_arm_and_releasing_one_leaves_the_other(tmp_path: P
         assert session.run(lambda _: "over" if rig.clock.now() - start > 4.0 else "") == "over"
         recorder.save(wait=True)
     times, ways = np.array(list(seen)), np.array(list(seen.values())) - next(iter(seen.values()))
+    holds = [next(both for t, both in held.items() if t >= least) for least in (0.4, 1.5, 2.5, 3.5)]
+    assert holds == [[False, False], [True, True], [False, True], [False, False]]
     at = {t: ways[np.searchsorted(times, t)] for t in (1.0, 2.5, 3.9)}
     assert abs(at[1.0]).max() < 1e-4, "a squeeze moves nothing"
     assert abs(at[2.5][0] - [0.1, 0, 0]).max() < 0.015, "the left one braked when its hand let go"
