@@ -40,7 +40,7 @@ MODELS = {
     1190: ServoModel("XL330-M077", 5.0, 0.215, 383),
     1200: ServoModel("XL330-M288", 5.0, 0.52, 103),
 }
-"""By their numbers; of the manual's data sheets, the XM430-W350 and the smaller ones from memory."""
+"""By their numbers; stall torques and speeds are those of ROBOTIS (e-manual)."""
 
 
 def _make_table() -> list[int]:
