@@ -199,7 +199,7 @@ class Person:
         self.pad.release(button)
 
     def _moves(self) -> bool:
-        return bool(np.abs(self.arm.state().dq_set).max() > 1e-3)
+        return bool(np.abs(self.arm.state(5.0).dq_set).max() > 1e-3)
 
     def _hold(self, until: Callable[[], bool]) -> None:
         """Hold L2 until a condition; press anew if a press did not count, or a busy computer stopped the arm."""
@@ -212,12 +212,17 @@ class Person:
             while not (met := until()) and (time.monotonic() < limit or self._moves()):
                 time.sleep(0.01)
 
+    def _keep_holding(self, until: Callable[[], bool]) -> None:
+        while not until():
+            self._hold(self._follows)
+            wait_until(lambda: until() or not self._follows(), "done")
+
     def _follows(self) -> bool:
-        return self.arm.state().status is hal.RobotStatus.FOLLOWING
+        return self.arm.state(5.0).status is hal.RobotStatus.FOLLOWING
 
     def _drive(self, until: Callable[[Any], bool], *buttons: str, **sticks: float) -> None:
         def there() -> bool:
-            return until(self.arm.state().tcp.position)
+            return until(self.arm.state(5.0).tcp.position)
 
         while not there():
             self._hold(self._follows)
@@ -237,8 +242,10 @@ class Person:
         self._drive(lambda tcp: tcp[0] > 0.54, "r1", dpad_y=1.0)
         self._drive(lambda tcp: tcp[2] < 0.03, "r1")
         self.pad.stick("r2", 1.0)
-        wait_until(lambda: gripper.state().grasped, "grasped")
+        self._keep_holding(lambda: gripper.state(5.0).grasped)
         self._drive(lambda tcp: tcp[2] > 0.1, "l1")
+        lifted = CUBE["position"][2] + 0.055
+        self._keep_holding(lambda: self.rig.world.pose("cube").position[2] > lifted)  # the world may be late
 
     def _put_down(self) -> None:
         gripper = self.arm.gripper
@@ -246,7 +253,7 @@ class Person:
         self._drive(lambda tcp: tcp[1] < -0.08, dpad_x=1.0)
         self._drive(lambda tcp: tcp[2] < 0.033, "r1")
         self.pad.stick("r2", 0.0)
-        wait_until(lambda: gripper.state().width > 0.07, "open")
+        self._keep_holding(lambda: gripper.state(5.0).width > 0.07)
         self._drive(lambda tcp: tcp[2] > 0.1, "l1")
 
 
@@ -335,7 +342,7 @@ def test_edits_of_the_world_are_drawn_and_undone_for_the_next_program(fr3: Bench
     with fr3.open() as rig:
         rig.world.add(ball)
         assert "ball" in rig.world.bodies
-        frame = rig.cameras["scene"].read(after=rig.clock.now())
+        frame = rig.cameras["scene"].read(after=rig.clock.now(), timeout=10.0)
         assert frame.color is not None
         with pytest.raises(hal.DeviceNotFound):
             rig.world.pose("bell")

@@ -125,8 +125,7 @@ def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | 
     if options.unpaced:
         raise ValueError("--config does not go with --unpaced: an app in simulated time has a world of its own")
     arm = find_arm(options.config, options.set, "franka", options.host)
-    if not options.lockstep:  # that one waits for who is late
-        raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
+    raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
     return enter_world(stack, options.config, options.set, arm)
 
 
