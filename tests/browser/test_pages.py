@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from .kit import Bench, Browser, need_browser, wait_for
+from .moves import drive_left, let_go_of_all
 
 
 @pytest.fixture
@@ -70,11 +71,9 @@ def test_the_cameras_show_what_happens() -> None:
         browser.wait_driving()
         wait_for(lambda: browser.run(picture)[1] > 50, "a picture with something in it")
         still = browser.run(picture)[0]
-        browser.hold()
-        with browser.drag("dpad", -1.0, 0.0):
-            wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
-            wait_for(lambda: browser.run(picture)[0] != still, "another picture")
-        browser.let_go()
+        drive_left(bench, browser)
+        wait_for(lambda: browser.run(picture)[0] != still, "another picture")
+        let_go_of_all(browser)
         wait_for(lambda: int(browser.text(".camera .numbers").split("/s")[0] or 0) > 5, "a rate")
         assert browser.complaints() == []
     finally:

@@ -269,7 +269,7 @@ def test_a_fault_is_shown_and_its_remedy_is_what_recovers(bench: Bench, moving: 
     wait_for(lambda: "joint 3 is too warm" in moving.text("#fault"), "the page to tell the fault")
     button = re.search('Press "(.+)", then release everything and hold again', moving.text("#fault-remedy"))
     assert button is not None, "the remedy is in the words of the page"
-    assert "()" not in moving.text("#fault") + moving.text("#log"), "what a program calls is no use here"
+    assert "recover()" not in moving.text("#fault") + moving.text("#log"), "what a program calls is no use here"
     (named,) = moving.run(BUTTONS, button[1])
     moving.key("ArrowLeft", "ArrowLeft", False)
     moving.let_go()
