@@ -73,7 +73,7 @@ def test_without_a_pad_the_app_prints_a_link_that_works_and_a_tunnel() -> None:
         assert "Open this in a browser to drive" in printed
         assert urlsplit(link).hostname == "127.0.0.1"
         rig = hello(link)["rig"]
-    assert (rig["sim"], rig["attended"], rig["drivable"], rig["demo"]) == (True, False, True, True)
+    assert (rig["sim"], rig["drivable"], rig["demo"]) == (True, True, True)
     assert [robot["name"] for robot in rig["robots"]] == ["panda"]
 
 

@@ -67,7 +67,6 @@ class App:
         known = {
             "source": "test",
             "sim": True,
-            "attended": False,
             "drivable": True,
             "driven_by": None,
             "demo": True,

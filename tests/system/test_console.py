@@ -184,7 +184,8 @@ async def test_a_console_that_is_stopped_holds_up_no_recording_and_shows_the_new
     finally:
         os.kill(process_of(rig), signal.SIGCONT)
     async with page_of(rig) as page:
-        while (await page.next("say"))["text"] != "said before":
-            pass
         while (await page.next("recording"))["frames"] != 19_999:
+            pass
+    async with page_of(rig) as page:
+        while (await page.next("say"))["text"] != "said before":
             pass
