@@ -178,7 +178,7 @@ class RigLink:
         """Wait until something comes, at most ``timeout`` s; return whether it came from one of the ``others``."""
         ready = select.select([self._sock, *others], [self._sock] if self._unsent else [], [], timeout)[0]
         self._idle = self._sock not in ready
-        return len(ready) > (not self._idle)
+        return any(other in ready for other in others)
 
     # Receiving.
 

@@ -163,6 +163,7 @@ def enter_world(
     Raises ConfigError, and ConnectionLost and ValueError if its world does not start, or has no such arm.
     """
     stack.enter_context(run_world(config, overrides))
+    raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late; the world inherits none
     world = ArmInWorld(address_of(arm), arm.name, role)
     stack.callback(world.close)
     return world

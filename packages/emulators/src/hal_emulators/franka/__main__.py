@@ -13,7 +13,7 @@ from hal.config.data_files import find_data
 from hal.drivers.franka.limits import LIMITS
 from hal.errors import HalError
 from hal_emulators.control import CONTROL_PORT, CommandPort, help_text, make_parser, note_signals, serve_prompt
-from hal_emulators.shared_world import PRIORITY, ArmInWorld, enter_world, find_arm, raise_priority
+from hal_emulators.shared_world import ArmInWorld, enter_world, find_arm
 
 from .arm import EmulatedArm, RobotFiles
 from .console import COMMANDS, Executor
@@ -125,7 +125,6 @@ def _enter_world(options: argparse.Namespace, stack: ExitStack) -> ArmInWorld | 
     if options.unpaced:
         raise ValueError("--config does not go with --unpaced: an app in simulated time has a world of its own")
     arm = find_arm(options.config, options.set, "franka", options.host)
-    raise_priority(PRIORITY)  # of an arm that is late, the world and its pictures are late
     return enter_world(stack, options.config, options.set, arm)
 
 
