@@ -100,9 +100,3 @@ def test_without_pytest_the_error_names_it() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "hal.testing needs pytest" in done.stderr
     assert "pip install pytest" in done.stderr
-
-
-def test_the_example_driver_and_its_test_have_less_than_a_hundred_lines() -> None:
-    text = (HERE.parents[1] / "docs" / "test-a-driver.md").read_text()
-    files = dict(re.findall(r"<!-- file: (\S+) -->\n```python\n(.*?)^```", text, re.S | re.M))
-    assert sum(files[name].count("\n") for name in ("net_camera.py", "test_net_camera.py")) < 100

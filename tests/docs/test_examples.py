@@ -106,6 +106,11 @@ def test_the_driver_to_copy_passes_its_tests_outside_and_is_found_by_name_once_i
     assert re.search(r"arm\b.*\btcp_arm\b", done.stdout), done.stdout
 
 
+def test_the_camera_to_copy_is_short() -> None:
+    """Its ``fake_camera.py`` and ``test_net_camera.py`` run where ``docs/test-a-driver.md`` shows them."""
+    assert len((EXAMPLES / "net_camera" / "net_camera.py").read_text().splitlines()) <= 65
+
+
 def test_every_example_is_tested_here_and_uses_nothing_private() -> None:
     here = Path(__file__).read_text()
     for file in EXAMPLES.rglob("*.py"):
