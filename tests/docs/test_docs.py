@@ -13,11 +13,14 @@ from hal.errors import ConfigError
 from .blocks import RUN, SHOWN, Block, anchors_of, blocks_of, links_of
 from .running import HANG, ROOT, Reader
 
-DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+DOCUMENTS = [
+    ROOT / "README.md",
+    *(file for place in ("C*.md", "docs/**/*.md", "packages/*/README.md") for file in sorted(ROOT.glob(place))),
+]
 
 
 def names(paths: list[Path]) -> list[str]:
-    return [path.name for path in paths]
+    return [f"{path.parent.name}/{path.name}" for path in paths]
 
 
 @pytest.fixture
@@ -40,7 +43,7 @@ def test_what_a_document_shows_runs(document: Path, reader: Reader) -> None:
     blocks = [block for block in blocks_of(document) if block.language in RUN]
     if document.name == "your-own-arm.md":
         pytest.importorskip("pybullet_data", reason="its URDF comes with PyBullet")
-    if document.name == "coming-from-ark.md":
+    if document.parent.name == "import-ark":
         pytest.importorskip("hal_import_ark", reason="needs pip install -e packages/import-ark")
     for block in blocks:
         reader.do(block)

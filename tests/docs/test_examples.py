@@ -81,7 +81,10 @@ def test_the_unit_tests_with_the_mock_pass(tmp_path: Path) -> None:
 
 @pytest.mark.pair
 def test_the_driver_to_copy_passes_its_tests_outside_and_is_found_by_name_once_installed(tmp_path: Path) -> None:
-    """``tcp_arm.py`` with ``fake_arm.py`` and ``test_tcp_arm.py``: first as a folder, then as a package."""
+    """``tcp_arm.py`` with ``fake_arm.py`` and ``test_tcp_arm.py``: first as a folder, then as a package.
+
+    ``docs/write-a-driver.md`` runs its ``hand_and_pedal.py``.
+    """
     folder = tmp_path / "tcp_arm"
     shutil.copytree(EXAMPLES / "tcp_arm", folder, ignore=shutil.ignore_patterns("__pycache__"))
     assert len((folder / "tcp_arm.py").read_text().splitlines()) <= 120

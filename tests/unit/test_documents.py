@@ -12,7 +12,10 @@ from app_kit import run_here
 from hal.apps.main import PROGRAMS, main
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+DOCUMENTS = [
+    ROOT / "README.md",
+    *(file for place in ("C*.md", "docs/**/*.md", "packages/*/README.md") for file in sorted(ROOT.glob(place))),
+]
 
 
 def test_numbers_in_safety_md_are_those_of_the_code() -> None:
@@ -29,7 +32,7 @@ def test_numbers_in_safety_md_are_those_of_the_code() -> None:
         assert value == pytest.approx(stated), f"{module}.py {name} is {value}, docs/safety.md has {number} {unit}"
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=[path.name for path in DOCUMENTS])
+@pytest.mark.parametrize("document", DOCUMENTS, ids=[f"{path.parent.name}/{path.name}" for path in DOCUMENTS])
 def test_the_files_that_a_document_names_are_there(document: Path) -> None:
     text = document.read_text(encoding="utf-8")
     for path in set(re.findall(r"`((?:hal|tests|drivers|benchmarks|config|apps)/[\w/]+\.\w+)`", text)):
