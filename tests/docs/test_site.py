@@ -17,7 +17,8 @@ pytest.importorskip("mkdocstrings", reason="needs pip install -e '.[docs]'")
 
 pytestmark = pytest.mark.timeout(360)  # at idle priority it may take much longer than alone
 ROOT = Path(__file__).resolve().parents[2]
-PUBLIC = ("hal", "hal.commands", "hal.errors", "hal.driver", "hal.recording", "hal.calibration", "hal.testing")
+MODULES = "commands", "errors", "driver", "gym", "recording", "calibration", "testing"
+PUBLIC = ("hal", *(f"hal.{name}" for name in MODULES))
 """Modules whose every public name is in the reference."""
 
 

@@ -35,8 +35,10 @@ RewardType = Literal["dense", "sparse"]
 Judge = Literal["truth", "depth"]
 """Where the poses of the objects come from: the simulation, or the picture of a camera with depth."""
 
-OPEN, CLOSED = -1.0, 1.0
-"""Last number of an action: the fingers."""
+OPEN = -1.0
+"""Last number of an action that opens the fingers."""
+CLOSED = 1.0
+"""Last number of an action that closes the fingers."""
 AREA = 0.1
 """Half the side of the square of the table in which a task takes place, m."""
 HEIGHT = 0.13
