@@ -16,6 +16,8 @@ from ..preflight import may_lock_memory
 
 PRIORITY = 50
 """Priority of a host among SCHED_FIFO processes, 1 to 99."""
+LINK_PRIORITY = PRIORITY - 2
+"""Priority of the ends of a link between computers: whatever comes over it delays no host."""
 SLICE = 1e-4
 """Slice of a host that may not use SCHED_FIFO, s: the shorter, the sooner it runs after it wakes."""
 RUNAWAY = 2, 10
@@ -30,7 +32,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_TIMERSLACK = 29
 
 
-def prepare_process(realtime: bool) -> None:
+def prepare_process(realtime: bool, priority: int = PRIORITY) -> None:
     """Make this process wake up on time.
 
     Needs no right: a timer slack of 1 ns and no garbage collection.
@@ -38,6 +40,7 @@ def prepare_process(realtime: bool) -> None:
     Args:
         realtime: Also ask for SCHED_FIFO, or a slice of :data:`SLICE` where it is refused, and lock the memory where
             that is allowed. Other threads, and children, do not inherit the priority.
+        priority: Priority for SCHED_FIFO.
     """
     gc.collect()
     gc.freeze()
@@ -50,13 +53,18 @@ def prepare_process(realtime: bool) -> None:
         return
     _limit_runaway()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+        raise_thread(priority)
         for thread in _noted & _list_threads():
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY - 1))
     except OSError:
         _shorten_slice()
     if may_lock_memory():
         libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)  # without the last, a new thread takes ms
+
+
+def raise_thread(priority: int) -> None:
+    """Give SCHED_FIFO to this thread, and not to those that it starts. Raises OSError if that is refused."""
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
 def is_realtime() -> bool:

@@ -16,6 +16,7 @@ from .. import registry
 from ..errors import ConnectionLost, HalError
 from ..host.process import Channel, ChannelClosed, SharedMemory, pack_error, unpack_error
 from ..host.records import GroupMemory
+from ..host.scheduling import LINK_PRIORITY, prepare_process
 from ..keys import Credentials, needs_keys
 from ..kinematics.composition import keep_urdf
 from ..specs import CameraSpec, GroupSpec, PadSpec, RobotSpec, from_json
@@ -158,4 +159,6 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     """Run the child process of a group at another computer."""
     spec = from_json(GroupSpec, config["group"])
     memory = GroupMemory.of(memories[0].buffer, spec)
-    LinkClient(channel, memory, spec).run()
+    client = LinkClient(channel, memory, spec)
+    prepare_process(config["realtime"], LINK_PRIORITY)
+    client.run()

@@ -19,6 +19,7 @@ from ..errors import CommandError, ConnectionLost, ControlTaken, HalError, NotSu
 from ..host.hosts import RemoteHost
 from ..host.process import STOP_LIMIT, pack_error
 from ..host.records import GripperMail, RobotMail
+from ..host.scheduling import LINK_PRIORITY, raise_thread
 from ..servo.watchdog import SILENCE
 from ..specs import CameraSpec, PadSpec, Plan, RobotSpec, to_json
 from .boxes import boxes_of_hosts, boxes_of_program
@@ -70,7 +71,10 @@ class Served:
         try:
             for host in () if self._watches else self.hosts:
                 host.lend(True)
-            link.post({"ready": {"realtime": all(host.child.ready["realtime"] for host in self.hosts)}})
+            realtime = all(host.child.ready["realtime"] for host in self.hosts)
+            if realtime and not self._watches:
+                raise_thread(LINK_PRIORITY)
+            link.post({"ready": {"realtime": realtime}})
             self._copy()
             self._take_back()
             link.say_last({"closed": True})

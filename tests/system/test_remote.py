@@ -28,7 +28,9 @@ from hal.apps import collect, replay, rollout
 from hal.deadman import Deadman
 from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
 from hal.host import records
+from hal.host.scheduling import LINK_PRIORITY
 from hal.lock import APP_MARK
+from hal.preflight import check_machine
 from hal.recording import Dataset, Recorder
 from hal.remote.client import connect
 from hal.servo.watchdog import SILENCE
@@ -69,6 +71,17 @@ def drive(rig: hal.Rig) -> dict[str, Any]:
     return {"moved": moved, "streamed": streamed, "width": arm.gripper.state().width, "stop": stop.value.code}
 
 
+def may_raise() -> bool:
+    return next(verdict for verdict in check_machine() if verdict.name == "scheduling").level == "ok"
+
+
+def find_priority(process: int) -> int:
+    """Return the real-time priority of the one thread of a process that copies records; 0 for none."""
+    found = [os.sched_getparam(int(thread)).sched_priority for thread in os.listdir(f"/proc/{process}/task")]
+    assert found.count(0) >= len(found) - 1, found
+    return max(found)
+
+
 def roll_out(arm_at: str, folder: Path) -> None:
     """Run ``hal rollout`` with an arm, a camera and a policy of three other computers, as if all were of one."""
     view = {"model": "realsense_d435", "output": {"width": 160, "height": 120}}
@@ -102,6 +115,8 @@ def test_the_same_programs_drive_an_arm_of_another_computer(tmp_path: Path) -> N
             state = rig.robots["panda"].state()
             assert 0.0 <= rig.clock.now() - state.stamp.t < 0.1
             there = drive(rig)
+            for end in (rig._hosts[0].child.process.pid, server.pid):
+                assert find_priority(end) == (LINK_PRIORITY if may_raise() else 0)
             link = rig.statistics()[at]["link"]
             assert abs(link["offset_s"]) <= link["round_trip_s"] / 2.0, "one computer has one clock"
         with hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides={"cameras": {}}) as rig:
