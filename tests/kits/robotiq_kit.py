@@ -64,7 +64,7 @@ def emulated_robotiq(line: str = "serial", paced: bool = True, active: bool = Tr
     """
     (spec,) = find_grippers("franka_robotiq", robotiq_overrides(line))
     with RobotiqEmulator([spec], paced=paced) as emulator, closing(RobotiqGripper(spec)) as driver:
-        gripper = emulator.ports["arm"].gripper
+        gripper = emulator.lines["arm"].gripper
         if active:
             gripper.request, gripper.state = Request(1), 3
         yield FarGripper(driver, emulator, gripper, paced)

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import gc
 import json
-import random
 import selectors
 import socket
 import sys
@@ -25,11 +24,12 @@ from .control import (
     assign,
     between,
     note_signals,
+    read_end,
     read_loopback,
-    read_number,
     run_command,
     serve_prompt,
 )
+from .lines import Losses
 from .shared_world import PRIORITY, ArmInWorld, enter_world, find_arm, raise_priority
 
 
@@ -81,7 +81,7 @@ class NetworkArm:
         """Whether the rig of that world has a gripper at this controller."""
         self.lost = 0
         """Number of states that were left out."""
-        self._random = random.Random(seed)
+        self.losses = Losses(seed)
         self._selector = selectors.DefaultSelector()
         self.clients: list[Any] = []
         self._late: deque[tuple[float, Client, bytes]] = deque()
@@ -91,7 +91,8 @@ class NetworkArm:
         self._listen_all()
 
     def _calm(self) -> None:
-        self.lose = self.delay = self.mute_until = self.silent_until = self.cut_until = 0.0
+        self.losses.clear()
+        self.delay = self.mute_until = self.silent_until = self.cut_until = 0.0
 
     def _listen(self, port: int) -> socket.socket:
         listener = socket.create_server((self.host, port))
@@ -214,7 +215,7 @@ class NetworkArm:
 
     def send_state(self, client: Client, data: bytes) -> None:
         """Send a state, unless it is lost; late if they are."""
-        if self.lose and self._random.random() < self.lose:
+        if self.losses.take():
             self.lost += 1
         elif self.delay or self._late:
             self._late.append((time.monotonic() + self.delay, client, data))
@@ -253,17 +254,12 @@ def take_lines(client: Client) -> list[str]:
     return [line.decode(errors="replace").strip() for line in lines]
 
 
-def _read_time(word: str) -> float:
-    """Return the time in so many s. Raises ValueError."""
-    return time.monotonic() + read_number(word, 0.0, 1e9)
-
-
 COMMANDS = (
-    Command("lose SHARE", "leave out this share of the states", assign("lose", between(0.0, 1.0))),
+    Command("lose SHARE", "leave out this share of the states", assign("losses.share", between(0.0, 1.0))),
     Command("late S", "send states so much later", assign("delay", between(0.0, 10.0))),
-    Command("mute S", "answer no commands; states go on", assign("mute_until", _read_time)),
-    Command("silence S", "answer nothing and send nothing; the connections stay", assign("silent_until", _read_time)),
-    Command("cut S", "close all connections, and accept none", lambda arm, words: arm.cut(_read_time(words[0]))),
+    Command("mute S", "answer no commands; states go on", assign("mute_until", read_end)),
+    Command("silence S", "answer nothing and send nothing; the connections stay", assign("silent_until", read_end)),
+    Command("cut S", "close all connections, and accept none", lambda arm, words: arm.cut(read_end(words[0]))),
     Command("refresh", "end all faults, and put the arm back where it began", lambda arm, _: arm.refresh()),
     Command("status", "what the arm does, and the last events", lambda arm, _: arm.report()),
 )

@@ -138,7 +138,7 @@ def test_closing_lowers_an_outstretched_arm_slowly_and_never_drops_it(yam: Bench
 
 def test_closing_does_not_switch_off_motors_whose_replies_are_lost(yam: Bench) -> None:
     driver = engaged_yam(yam)
-    yam.bus.faults[yam.spec.name].lost_share = 1.0
+    yam.emulator.execute("lose 1")
     driver.close()
     assert all(yam.arm.motors[k].status != MotorStatus.DISABLED for k in range(1, 7))
     assert yam.fastest(1.0) < 0.5

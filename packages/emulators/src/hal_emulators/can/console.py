@@ -63,12 +63,9 @@ def _motor(target: _Target, word: str, other: str = "") -> int:
 
 
 def _lose(target: _Target, words: list[str]) -> None:
-    faults = target.faults
-    if words[0] == "next":
-        motor = _motor(target, words[2]) if len(words) > 2 else 0
-        faults.lose_next[motor] = _int(words[1], "the number of replies", 0, 1_000_000)
-    else:
-        faults.lost_share = read_number(words[0], 0.0, 1.0)
+    if len(words) > 2:
+        _motor(target, words[2])
+    target.faults.losses.set(words)
 
 
 def _silent(target: _Target, words: list[str]) -> None:
@@ -163,7 +160,7 @@ def _stats(target: _Target, words: list[str]) -> dict[str, Any]:
 
 def _reset(target: _Target, words: list[str]) -> None:
     """Take every fault away; what was done to the motors' registers stays."""
-    target.faults.__init__()  # type: ignore[misc]
+    target.faults.reset()
     target.bus.cut_until = 0.0
     target.arm.plant.friction = 1.0
     target.arm.plant.load(mass_factor=1.0, payload=(0.0, (0.0, 0.0, 0.0)))

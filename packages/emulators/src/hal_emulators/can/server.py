@@ -9,12 +9,11 @@ from __future__ import annotations
 import contextlib
 import heapq
 import itertools
-import random
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import can
 
@@ -22,65 +21,31 @@ from hal.config.loader import load
 from hal.drivers.can.settings import BusSettings
 from hal.drivers.scene.shared import address_of
 from hal.specs import RobotSpec
+from hal_emulators.lines import Losses
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .damiao import EmulatedDamiaoArm
 from .piper import EmulatedPiperArm
-from .plant import ArmPlant
 
 _STEP = 1e-3
 """Step of the mechanics, s."""
 _LONGEST_GAP = 0.25
 """Time that the mechanics make up for after the machine had no time for them, s."""
+EmulatedArm = EmulatedDamiaoArm | EmulatedPiperArm
 _ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": EmulatedDamiaoArm, "piper": EmulatedPiperArm}
-
-
-class EmulatedArm(Protocol):
-    """An arm on a bus, as its bus and the console see it."""
-
-    name: str
-    bus: BusSettings
-    plant: ArmPlant
-    peak: list[float]
-    world: ArmInWorld | None
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        """Numbers of its motors, as the console's commands name them."""
-
-    def take(self, id: int, data: bytes, send: Callable[[int, bytes, int], None]) -> None:
-        """Take a frame from the bus, and answer it."""
-
-    def step(self, dt: float, send: Callable[[int, bytes, int], None]) -> None:
-        """Let time pass."""
-
-    def restart(self) -> None:
-        """Switch the arm's power off and on again."""
-
-    def report(self) -> dict[str, Any]:
-        """Return its state."""
-
-    def set_status(self, number: int, status: int) -> None:
-        """Raise a fault at a motor."""
-
-    def set_register(self, number: int, name: str, value: float) -> None:
-        """Change a register of a motor."""
-
-    def set_temperature(self, number: int, driver: int, motor: int) -> None:
-        """Change what a motor reports, deg C."""
-
-    def set_object(self, width: float | None) -> None:
-        """Put an object between the fingers, or take it away."""
 
 
 class FrameFaults:
     """What happens to the frames of one arm on their way."""
 
-    def __init__(self) -> None:
-        self.lost_share = 0.0
-        """Share of the replies that is lost."""
-        self.lose_next: dict[int, int] = {}
-        """Number of a motor, 0 for any -> how many of its next replies are lost."""
+    def __init__(self, seed: int = 0) -> None:
+        self.losses = Losses(seed)
+        """Replies that are lost, by the number of the motor."""
+        self.reset()
+
+    def reset(self) -> None:
+        """End all of them."""
+        self.losses.clear()
         self.delay = 0.0
         """Lateness of the replies, s."""
         self.copies = 1
@@ -91,14 +56,6 @@ class FrameFaults:
     def silent(self, motor: int, now: float) -> bool:
         until = self.silent_until
         return bool(until) and (until.get(0, 0.0) > now or until.get(motor, 0.0) > now)
-
-    def lose(self, motor: int, source: random.Random) -> bool:
-        for number in (motor, 0):
-            left = self.lose_next.get(number, 0)
-            if left > 0:
-                self.lose_next[number] = left - 1
-                return True
-        return self.lost_share > 0.0 and source.random() < self.lost_share
 
 
 class EmulatedBus:
@@ -119,13 +76,12 @@ class EmulatedBus:
         self.settings = settings
         self._realtime = realtime
         self.arms = {arm.name: arm for arm in arms}
-        self.faults = {arm.name: FrameFaults() for arm in arms}
+        self.faults = {arm.name: FrameFaults(seed) for arm in arms}
         self.lock = threading.Lock()
         self.cut_until = 0.0
         self.stall = 0.0
         self.received = self.late = 0
         self.error: Exception | None = None
-        self._random = random.Random(seed)
         self._waiting: list[tuple[float, int, int, bytes]] = []
         """Late frames: time, order, id, data."""
         self._order = itertools.count()
@@ -221,7 +177,7 @@ class EmulatedBus:
 
         def send(id: int, data: bytes, motor: int) -> None:
             now = time.monotonic()
-            if now < self.cut_until or faults.silent(motor, now) or faults.lose(motor, self._random):
+            if now < self.cut_until or faults.silent(motor, now) or faults.losses.take(motor):
                 return
             for _ in range(faults.copies):
                 if faults.delay > 0.0:
@@ -277,17 +233,11 @@ class CanEmulator:
     def bus_of(self, arm: EmulatedArm) -> EmulatedBus:
         return next(bus for bus in self.buses if arm.name in bus.arms)
 
-    def start(self) -> None:
+    def __enter__(self) -> CanEmulator:
         for bus in self.buses:
             bus.start()
-
-    def stop(self) -> None:
-        for bus in self.buses:
-            bus.stop()
-
-    def __enter__(self) -> CanEmulator:
-        self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
+        for bus in self.buses:
+            bus.stop()

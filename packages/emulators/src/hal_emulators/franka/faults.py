@@ -5,36 +5,12 @@ from __future__ import annotations
 import random
 from collections import deque
 
+from hal_emulators.lines import Losses
+
 from .motion import DT, Floats, MotionSample
 
 _SWING = 0.08
 """Share of its distance from the set-point by which an arm in unrest moves back and forth, a cycle each."""
-
-
-class PacketLoss:
-    """Loses packets: a share of them, chosen by a seeded generator, or exactly the next few."""
-
-    def __init__(self, seed: int) -> None:
-        self._random = random.Random(seed)
-        self.share = 0.0
-        self.next = 0
-
-    def set(self, words: list[str]) -> None:
-        """Set the loss by ``["0.05"]`` or ``["next", "3"]``. Raises ValueError."""
-        if words[:1] == ["next"] and len(words) == 2:
-            self.next = int(words[1])
-            return
-        (text,) = words
-        share = float(text)
-        if not 0.0 <= share <= 1.0:
-            raise ValueError("a share is from 0 to 1")
-        self.share, self.next = share, 0
-
-    def loses_next(self) -> bool:
-        if self.next > 0:
-            self.next -= 1
-            return True
-        return self.share > 0.0 and self._random.random() < self.share
 
 
 class SetpointReports:
@@ -92,12 +68,12 @@ class Unrest:
 
 class InjectedFaults:
     def __init__(self, seed: int) -> None:
-        self.seed = seed
+        self.states, self.commands = Losses(seed), Losses(seed + 1)
         self.clear()
 
     def clear(self) -> None:
-        self.states = PacketLoss(self.seed)
-        self.commands = PacketLoss(self.seed + 1)
+        self.states.clear()
+        self.commands.clear()
         self.silent_until = 0.0
         """End of a silence on the monotonic clock, s."""
         self.truncate = False

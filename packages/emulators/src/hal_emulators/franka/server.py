@@ -99,14 +99,10 @@ class ArmRequest(NamedTuple):
 
 def listen(host: str, port: int) -> socket.socket:
     """Return a listening socket. Raises OSError that names host and port."""
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((host, port))
-        listener.listen(4)
+        listener = socket.create_server((host, port))
     except OSError as error:
-        listener.close()
-        raise OSError(error.errno, f"cannot listen on {host}:{port}: {error.strerror}") from None
+        raise OSError(error.errno, f"cannot listen on {host}:{port}: {os.strerror(error.errno or 0)}") from None
     listener.setblocking(False)
     return listener
 
@@ -340,7 +336,7 @@ class ArmServer:
         counters, motion = self.arm.counters, self.arm.motion
         for data in session.commands():
             counters.commands += 1
-            if motion is not None and self.faults.commands.loses_next():
+            if motion is not None and self.faults.commands.take():
                 counters.thrown_away += 1
                 self._answered = True
                 continue
@@ -446,7 +442,7 @@ class ArmServer:
     def _send_state(self, session: ArmClient, packet: bytearray) -> None:
         faults, counters, motion = self.faults, self.arm.counters, self.arm.motion
         self._sent_at = time.monotonic()
-        if self._sent_at < faults.silent_until or faults.states.loses_next():
+        if self._sent_at < faults.silent_until or faults.states.take():
             self._state_sent = False
             counters.states_lost += 1
             return

@@ -27,12 +27,12 @@ def _start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Started:
     emulator = RobotiqEmulator(find_grippers(options.config, options.set), options.seed, realtime=True)
     if not options.no_world and has_world(options.config, options.set):
         for robot in load(options.config, sim=False, overrides=options.set).resolve().robots:
-            if robot.name in emulator.ports:
-                emulator.ports[robot.name].gripper.in_world = True
+            if robot.name in emulator.lines:
+                emulator.lines[robot.name].gripper.in_world = True
                 world = enter_world(stack, options.config, options.set, robot, role="fingers")
                 emulator.worlds[robot.name] = world
     stack.enter_context(emulator)
-    places = ", ".join(f"{arm} at {port.gripper.settings.place}" for arm, port in emulator.ports.items())
+    places = ", ".join(f"{arm} at {port.gripper.settings.place}" for arm, port in emulator.lines.items())
     return Started(emulator.execute, places)
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
-import random
 import re
 import socket
 import struct
 from time import monotonic
 
 from hal.drivers.robotiq.link import TEXT_PORT, Request, crc16
+from hal_emulators.lines import Line
 from hal_emulators.terminal import PseudoTerminal
 
 from .gripper import EmulatedGripper
@@ -19,32 +18,24 @@ from .gripper import EmulatedGripper
 __all__ = ["Port", "SerialPort", "TextPort"]
 
 
-class Port:
-    """The faults that both kinds of line have; times are on the monotonic clock, s."""
+class Port(Line):
+    """What both kinds of line have in common."""
 
     def __init__(self, gripper: EmulatedGripper, seed: int = 0) -> None:
+        super().__init__(seed)
         self.gripper = gripper
         self.t = self.asked = -math.inf
         """Time up to which its fingers have moved, and that of the newest request, s; for one in a simulated world."""
-        self.silent_until = self.out_until = self.delay = self.lost_share = 0.0
-        self.lose_next = self.garble_next = 0
-        self._random = random.Random(seed)
-        self._late: list[tuple[float, int, bytes]] = []
         self._came: dict[int, bytes] = {}
 
-    def open(self) -> None:
-        """Offer the line. Raises OSError."""
-        raise NotImplementedError
+    def reset(self) -> None:
+        super().reset()
+        self.silent_until = 0.0
 
     def close(self) -> None:
-        """Take the line away, as if it was unplugged."""
-        raise NotImplementedError
+        self._came = {}
 
-    def descriptors(self) -> list[int]:
-        """Return what to read from; none while the line is away."""
-        raise NotImplementedError
-
-    def answer(self, came: bytes) -> tuple[bytes, bytes]:
+    def execute(self, came: bytes) -> tuple[bytes, bytes]:
         """Return what is left of the bytes that have come, and the answer to the rest."""
         raise NotImplementedError
 
@@ -61,29 +52,19 @@ class Port:
         if now < self.silent_until or not self.gripper.powered:
             return True
         before = self.gripper.request
-        self._came[descriptor], answer = self.answer(self._came.get(descriptor, b"") + came)
+        self._came[descriptor], answer = self.execute(self._came.get(descriptor, b"") + came)
         if self.gripper.request != before:
             self.asked = now
-        if self.lose_next or self._random.random() < self.lost_share:
-            self.lose_next = max(0, self.lose_next - 1)
-        elif answer:
-            if self.garble_next:
-                self.garble_next -= 1
-                answer = answer[:-1] + bytes((answer[-1] ^ 0x55,))
-            self._late.append((now + self.delay, descriptor, answer))
+        if answer:
+            self.answer(descriptor, answer)
         return True
 
     def send_due(self, now: float) -> None:
-        """Send the answers that are due, and let power and line come back."""
+        """Let power come back as well."""
         if not self.gripper.powered and now >= self.gripper.on_at:
             self.gripper.powered = True
             self.gripper.switch_on()
-        if (now < self.out_until) == bool(self.descriptors()):
-            (self.close if self.descriptors() else self.open)()
-        while self._late and self._late[0][0] <= now:
-            _, descriptor, answer = self._late.pop(0)
-            with contextlib.suppress(OSError):
-                os.write(descriptor, answer)
+        super().send_due(now)
 
 
 class SerialPort(Port):
@@ -95,8 +76,8 @@ class SerialPort(Port):
         self._terminal.open()
 
     def close(self) -> None:
+        super().close()
         self._terminal.close()
-        self._late, self._came = [], {}
 
     def descriptors(self) -> list[int]:
         return self._terminal.descriptors
@@ -105,7 +86,7 @@ class SerialPort(Port):
         self._terminal.free()
         return super().serve(descriptor)
 
-    def answer(self, came: bytes) -> tuple[bytes, bytes]:
+    def execute(self, came: bytes) -> tuple[bytes, bytes]:
         answers = b""
         while len(came) >= 8:
             size = 9 + came[6] if came[1] == 16 else 8
@@ -152,10 +133,11 @@ class TextPort(Port):
         self._door = socket.create_server((str(self.gripper.settings.host), TEXT_PORT))
 
     def close(self) -> None:
+        super().close()
         for one in (self._door, *self._clients.values()):
             if one is not None:
                 one.close()
-        self._door, self._clients, self._late, self._came = None, {}, [], {}
+        self._door, self._clients = None, {}
 
     def descriptors(self) -> list[int]:
         return [] if self._door is None else [self._door.fileno(), *self._clients]
@@ -170,7 +152,7 @@ class TextPort(Port):
             self._clients.pop(descriptor).close()
         return True
 
-    def answer(self, came: bytes) -> tuple[bytes, bytes]:
+    def execute(self, came: bytes) -> tuple[bytes, bytes]:
         *lines, left = came.split(b"\n")
         return left, b"".join(self._execute(line.decode(errors="replace").split()) for line in lines)
 

@@ -1,4 +1,4 @@
-"""The emulator at work: one thread moves the arms of a rig in real time, and answers; commands inject faults.
+"""The emulator at work: the lines of a rig's arms on servo buses, which answer; commands inject faults.
 
 with ServoBusEmulator(find_arms("so101")) as emulator:
     emulator.execute("lose next 3 2")         # from any thread
@@ -6,12 +6,8 @@ with ServoBusEmulator(find_arms("so101")) as emulator:
 
 from __future__ import annotations
 
-import contextlib
 import os
-import random
-import select
 import termios
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
@@ -20,8 +16,9 @@ from typing import Any
 from hal.config.loader import load
 from hal.drivers.servo_bus.protocol import ALL, PING, READ, SYNC_READ, SYNC_WRITE, WRITE, Answer
 from hal.specs import RobotSpec
-from hal_emulators.control import Command, assign, make_commands, read_end, read_switch, run_command
-from hal_emulators.shared_world import PRIORITY, load_real, raise_priority
+from hal_emulators.control import Command, assign, make_commands, read_end, read_switch
+from hal_emulators.lines import LINE_COMMANDS, Line, LineEmulator
+from hal_emulators.shared_world import load_real
 from hal_emulators.terminal import PseudoTerminal
 
 from .arm import EmulatedArm
@@ -29,39 +26,37 @@ from .servo import ALERT, SERVOS, DynamixelServo, Servo
 
 __all__ = ["COMMANDS", "ServoBusEmulator", "find_arms", "find_leaders"]
 
-_STEP = 0.002
-"""Step of the mechanics, s."""
-_LONGEST_GAP = 0.25
-"""Time that the mechanics make up for after the machine had no time for them, s."""
 
-
-class ServoLine:
-    """The line of one arm, with the faults of its frames; times are on the monotonic clock, s."""
+class ServoLine(Line):
+    """The line of one arm, with the faults of its frames."""
 
     def __init__(self, arm: EmulatedArm, seed: int = 0) -> None:
+        super().__init__(seed)
         self.arm = arm
-        self.terminal = PseudoTerminal(arm.port)
-        self._random = random.Random(seed)
+        self._terminal = PseudoTerminal(arm.port)
         self._came = b""
-        self._late: list[tuple[float, bytes]] = []
-        self.out_until = self.off_until = 0.0
+        self.off_until = 0.0
         self.twins: set[int] = set()
         """Ids that two motors have."""
-        self.reset()
 
     def reset(self) -> None:
-        """End the faults of frames."""
-        self.lost_share = self.delay = 0.0
-        self.lose_next: dict[int, int] = {}
-        """Id, 0 for any -> how many of its next answers are lost."""
+        super().reset()
         self.silent_until: dict[int, float] = {}
-        self.copies, self.spoil_next = 1, 0
+        self.copies = 1
 
-    def serve(self) -> None:
-        """Take what has come, and answer."""
-        self.terminal.free()
+    def open(self) -> None:
+        self._terminal.open()
+
+    def close(self) -> None:
+        self._terminal.close()
+
+    def descriptors(self) -> list[int]:
+        return self._terminal.descriptors
+
+    def serve(self, descriptor: int) -> None:
+        self._terminal.free()
         try:
-            came = os.read(self.terminal.descriptors[0], 4096)
+            came = os.read(descriptor, 4096)
         except OSError:
             return
         self._hearing = [] if monotonic() < self.off_until else [s for s in self.arm.servos if self._can_hear(s)]
@@ -76,7 +71,7 @@ class ServoLine:
     def _can_hear(self, servo: Servo) -> bool:
         now, rate = monotonic(), getattr(termios, f"B{servo.baud}", None)
         silent = any(self.silent_until.get(key, 0.0) > now for key in (0, servo.id))
-        return servo.plugged and servo.boot <= now and rate == self.terminal.baud and not silent
+        return servo.plugged and servo.boot <= now and rate == self._terminal.baud and not silent
 
     def _take(self, frame: Answer) -> None:
         id, instruction, data = frame
@@ -111,36 +106,13 @@ class ServoLine:
             if isinstance(servo, DynamixelServo) and id == servo.registers[12] != servo.id and address >= servo.memory:
                 servo.write(address, data)
 
-    def _is_lost(self, id: int) -> bool:
-        for key in (id, 0):
-            if self.lose_next.get(key, 0) > 0:
-                self.lose_next[key] -= 1
-                return True
-        return self._random.random() < self.lost_share
-
     def _reply(self, answers: Sequence[tuple[Servo, int, bytes]]) -> None:
         """Let motors answer with an error and registers."""
         for servo, error, data in answers:
-            if self._is_lost(servo.id):
-                continue
             error |= (ALERT if servo.errors else 0) if isinstance(servo, DynamixelServo) else servo.errors
             frame = self.arm.protocol.encode_answer(servo.id, error, data)
-            if self.spoil_next:
-                self.spoil_next -= 1
-                frame = frame[:-1] + bytes((frame[-1] ^ 0x55,))
             copies = self.copies + (servo.id in self.twins)
-            self._late.append((monotonic() + self.delay, frame * copies))
-        self.send_due(monotonic())
-
-    def send_due(self, now: float) -> None:
-        """Send the answers that are due, and let the line come back."""
-        if (now < self.out_until) == bool(self.terminal.descriptors):
-            (self.terminal.close if self.terminal.descriptors else self.terminal.open)()
-        due = b"".join(frame for t, frame in self._late if t <= now)
-        self._late = [(t, frame) for t, frame in self._late if t > now]
-        if due and self.terminal.descriptors:
-            with contextlib.suppress(OSError):
-                os.write(self.terminal.descriptors[0], due)
+            self.answer(self.descriptors()[0], frame, servo.id, copies)
 
 
 def find_arms(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[RobotSpec]:
@@ -166,102 +138,31 @@ def find_leaders(config: str | Path | Mapping[str, Any], overrides: Sequence[str
     return list(load({"sim": False, "robots": arms}).resolve().robots)
 
 
-class ServoBusEmulator:
+class ServoBusEmulator(LineEmulator):
     """All arms of a rig on servo buses, each on its line.
 
     Attributes:
         arms: The arms by name.
-        lines: Their lines.
     """
 
     def __init__(self, arms: Iterable[RobotSpec], seed: int = 0, paced: bool = True, realtime: bool = False) -> None:
-        """Build the arms.
-
-        Args:
-            arms: Their records; see :func:`find_arms`.
-            seed: Of random losses.
-            paced: Whether they move in real time; otherwise only by :meth:`advance`.
-            realtime: Give the thread the priority of a servo, for a process that does nothing else.
+        """Build the arms, of :func:`find_arms`; ``seed`` is that of random losses, for the others see LineEmulator.
 
         Raises:
             ValueError: Two are on one port, which this emulator does not play, or a port is not an emulator's.
         """
+        super().__init__(paced, realtime)
         self.arms = {spec.name: EmulatedArm(spec) for spec in arms}
         if len({arm.port for arm in self.arms.values()}) < len(self.arms):
             raise ValueError("two emulated arms need two ports")
         self.lines = {name: ServoLine(arm, seed) for name, arm in self.arms.items()}
-        self._paced, self._realtime = paced, realtime
-        self.lock = threading.Lock()
-        self.read_end = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="servo-bus-emulator", daemon=True)
 
-    def advance(self, seconds: float) -> None:
-        """Take what has come, and move the arms by ``seconds`` at once."""
-        with self.lock:
-            for line in self.lines.values():
-                if line.terminal.descriptors and select.select(line.terminal.descriptors, [], [], 0.0)[0]:
-                    line.serve()
-            self._advance(seconds)
-
-    def _advance(self, seconds: float) -> None:
-        for _ in range(round(min(seconds, _LONGEST_GAP) / _STEP)):
-            for arm in self.arms.values():
-                arm.step(_STEP)
-
-    def _serve(self) -> None:
-        if self._realtime:
-            raise_priority(PRIORITY)  # a busy computer must not look like a silent motor
-        done = monotonic()
-        """Time up to which the arms have moved."""
-        while not self.read_end.is_set():
-            with self.lock:
-                now = monotonic()
-                done = max(done, now - _LONGEST_GAP)
-                if self._paced and now - done >= _STEP:  # one step at a time: who asks meanwhile is answered
-                    self._advance(_STEP)
-                    done += _STEP
-                for line in self.lines.values():
-                    line.send_due(now)
-                lines = {one: line for line in self.lines.values() for one in line.terminal.descriptors}
-            behind = self._paced and now - done >= _STEP
-            ready, _, _ = select.select(list(lines), [], [], _STEP / 20 if behind else _STEP / 2)
-            with self.lock:
-                for descriptor in ready:
-                    if descriptor in lines[descriptor].terminal.descriptors:  # no command took it away meanwhile
-                        lines[descriptor].serve()
-
-    def execute(self, line: str) -> dict[str, Any]:
-        """Execute a command, and return its answer; with several arms the arm's name is its first word.
-
-        Raises:
-            ValueError: It is invalid.
-        """
-        words = line.split()
-        name = words.pop(0) if words and words[0] in self.lines else next(iter(self.lines))
-        with self.lock:
-            return run_command(COMMANDS, self.lines[name], words)
-
-    def __enter__(self) -> ServoBusEmulator:
-        for line in self.lines.values():
-            line.terminal.open()
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.read_end.set()
-        self._thread.join(5.0)
-        for line in self.lines.values():
-            line.terminal.close()
+    def step(self, dt: float) -> None:
+        for arm in self.arms.values():
+            arm.step(dt)
 
 
 # Commands.
-
-
-def _lose(line: ServoLine, words: list[str]) -> None:
-    if words[0] == "next":
-        line.lose_next[int(words[2]) if len(words) > 2 else 0] = int(words[1])
-    else:
-        line.lost_share = float(words[0])
 
 
 def _silence(line: ServoLine, words: list[str]) -> None:
@@ -335,12 +236,14 @@ def _reset(line: ServoLine, _: list[str]) -> None:
 
 
 COMMANDS = make_commands(
-    Command("lose P | next N [ID]", "lose that share of the answers, or exactly the next N", _lose),
-    Command("late S", "send answers S seconds late", assign("delay", float)),
+    Command(
+        "lose P | next N [ID]",
+        "lose that share of the answers, or exactly the next N",
+        lambda line, words: line.losses.set(words),
+    ),
     Command("double on|off", "send each answer twice", assign("copies", lambda word: 1 + read_switch(word))),
     Command("spoil N", "spoil the checksum of the next N answers", assign("spoil_next", int)),
     Command("silent ID|all S|on|off", "neither hear nor answer", _silence),
-    Command("unplug S|on|off", "take the line away", assign("out_until", read_end)),
     Command("power [S|on|off]", "a brown-out: silent for 0.05 s or S, then without torque", _power),
     Command("twin ID on|off", "two motors have this id", _twin),
     Command("baud N", "let the motors listen at this rate only", _baud),
@@ -360,4 +263,6 @@ COMMANDS = make_commands(
     Command("object M|none", "put an object of this width into the jaw", _put),
     Command("state", "motion, goals, torque, errors", lambda line, _: line.arm.report()),
     Command("reset", "end all faults of frames and motors", _reset),
+    *LINE_COMMANDS,
 )
+ServoBusEmulator.COMMANDS = COMMANDS
