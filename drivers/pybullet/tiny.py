@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.drivers.scene.drawn import DrawnWorld
 from hal.drivers.scene.lighting import BACKGROUND
 from hal.drivers.scene.renderer import LUMINANCE, RenderedImages, Renderer
-from hal.drivers.scene.shapes import RenderScene, Visual
+from hal.drivers.scene.shapes import Visual
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import CameraSpec
 
@@ -26,7 +27,7 @@ class TinyRenderer(Renderer):
     DriverMissing.
     """
 
-    def __init__(self, scene: RenderScene) -> None:
+    def __init__(self, scene: DrawnWorld) -> None:
         self._scene = scene
         self._client = PyBulletClient()
         self._revision: int | None = None

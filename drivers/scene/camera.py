@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, TypeAlias
 
 from hal import registry
 from hal.driver import CameraDriver, CameraInfo, RawFrame
@@ -31,7 +31,6 @@ from .drawn import DrawnWorld
 from .exposure import Exposure, check_view
 from .mirror import LocalMirror, WorldMirror
 from .renderer import GLRenderer, Renderer
-from .shapes import RenderScene
 
 _NICE = 5
 """Niceness of the process that draws: pictures come after the servo."""
@@ -42,13 +41,8 @@ _IDLE = 0.001
 # --- the camera ------------------------------------------------------------------------------------------------------
 
 
-class FrameSource(Protocol):
-    def grab(self, timeout: float) -> RawFrame | None:
-        """Return the next frame, as :meth:`hal.camera.CameraDriver.grab`."""
-
-
 class SimulatedCamera(CameraDriver):
-    """A camera in the simulated world; ``source`` is a :class:`FrameSource`."""
+    """A camera in the simulated world; ``source`` is one of :data:`FrameSource`."""
 
     simulated: ClassVar[bool] = True
 
@@ -141,6 +135,9 @@ class SharedSource:
         else:
             self._seq = frame.seq
         return frame
+
+
+FrameSource: TypeAlias = DirectSource | SharedSource
 
 
 class SimulatedPictures(CameraRenderer):
@@ -291,7 +288,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
 # --- renderers -------------------------------------------------------------------------------------------------------
 
 
-def choose_renderer(scene: RenderScene, name: str = "auto") -> Renderer:
+def choose_renderer(scene: DrawnWorld, name: str = "auto") -> Renderer:
     """Return the renderer ``gl`` or ``tiny``, or with ``auto`` the first of them that works on this machine.
 
     Its ``description`` has the reason why ``gl`` was not chosen, and the remedy. Raises ConfigError for another name,

@@ -62,7 +62,7 @@ class DrawnBody:
 
 
 class DrawnWorld:
-    """All bodies of a world, at the poses of the newest snapshot; a :class:`.shapes.RenderScene`.
+    """All bodies of a world, at the poses of the newest snapshot.
 
     Before the first snapshot, and after an edit, bodies are at their initial poses. Raises ConfigError with every
     problem.

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from hal.randomization import vary_camera
 from hal.specs import CameraSpec
 
 from .disturbances import UNCHANGED, Randomized
+from .drawn import DrawnWorld
 from .renderer import RenderedImages, Renderer
 
 if TYPE_CHECKING:
@@ -29,15 +29,6 @@ _SIDES = ("infrared", "infrared_right")
 
 
 # --- frames ----------------------------------------------------------------------------------------------------------
-
-
-class PosedWorld(Protocol):
-    @property
-    def randomized(self) -> Randomized:
-        """What the world was randomized with."""
-
-    def pose(self, name: str, link: str | None = None) -> Mapping[str, Any]:
-        """Return ``position`` (3,) m and ``orientation`` (4,) xyzw of a link; raises DeviceNotFound."""
 
 
 class _Shot(NamedTuple):
@@ -81,7 +72,7 @@ class Exposure:
         streams = tuple(name for name in spec.streams if name not in self._sides and name != "infrared_right")
         self._main = _Shot(replace(spec, streams=streams), self._T_color) if streams else None
 
-    def capture(self, world: PosedWorld, renderer: Renderer, t: float, t_device: float, number: int) -> RawFrame:
+    def capture(self, world: DrawnWorld, renderer: Renderer, t: float, t_device: float, number: int) -> RawFrame:
         """Draw a frame of the present state of the world; its number also selects its noise.
 
         ``t`` and ``t_device`` are its stamps, s on the clocks of the rig and of the world.
@@ -181,7 +172,7 @@ def _side(spec: CameraSpec, name: str) -> _Shot:
     return _Shot(replace(spec, streams=("infrared",), K=spec.K_infrared or spec.K), view)
 
 
-def camera_pose(world: PosedWorld, spec: CameraSpec) -> Pose:
+def camera_pose(world: DrawnWorld, spec: CameraSpec) -> Pose:
     """Return the present pose of the colour sensor's optical frame in the world."""
     view = spec.view
     if view is None:
@@ -193,7 +184,7 @@ def camera_pose(world: PosedWorld, spec: CameraSpec) -> Pose:
     return Pose(link["position"], link["orientation"]) @ here
 
 
-def check_view(world: PosedWorld, spec: CameraSpec) -> None:
+def check_view(world: DrawnWorld, spec: CameraSpec) -> None:
     """Raise ConfigError when a camera has no place, or is attached to a missing arm or link."""
     view = spec.view
     if view is None:

@@ -1,7 +1,7 @@
 """Drawing: the interface of a renderer, and the one that draws with OpenGL.
 
 OpenGL draws without a window, on a graphics card or, with Mesa's llvmpipe, without one. Nothing here depends on a
-physics engine: what is drawn is a :class:`.scene.RenderScene`.
+physics engine: what is drawn is a :class:`.drawn.DrawnWorld`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
+from .drawn import DrawnWorld
 from .lighting import Backdrop, Light, Look, ShadowMap
 from .meshes import MeshLibrary
-from .shapes import DrawnPart, RenderScene, Visual, parts_of
+from .shapes import DrawnPart, Visual, parts_of
 from .textures import load_texture
 
 Array = NDArray[np.float64]
@@ -114,7 +115,7 @@ class GLRenderer(Renderer):
     missing; names the command that installs it.
     """
 
-    def __init__(self, scene: RenderScene, library: MeshLibrary | None = None) -> None:
+    def __init__(self, scene: DrawnWorld, library: MeshLibrary | None = None) -> None:
         self._scene = scene
         self._library = library or MeshLibrary()
         self._lock = threading.Lock()

@@ -1,21 +1,17 @@
-"""Shapes to draw: triangle meshes, primitive shapes, and the visual shapes of the bodies of a scene.
-
-What is drawn implements :class:`RenderScene`.
-"""
+"""Shapes to draw: triangle meshes, primitive shapes, and the visual shapes of the bodies of a scene."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.geometry import Pose
 
-from .lighting import Look
 from .textures import load_texture
 
 Array = NDArray[np.float64]
@@ -28,25 +24,13 @@ _TEXTURE = 0.25
 """Side of a texture that covers a body, m."""
 _CELLS = 6
 """Size of the details of a part that its shadow has, as a share of the part's radius: one of so many."""
-_PLANE_HALF = 50.0
-"""Half the side of the square that is drawn for an infinite plane, m."""
-
-
-class SceneBody(Protocol):
-    @property
-    def id(self) -> int:
-        """Its number, which no other body of this world gets."""
-
-    @property
-    def index(self) -> int:
-        """Value of its pixels in segmentation images."""
 
 
 class Visual(NamedTuple):
     link: int
     """Number of the link in its body; 0 is the base."""
     kind: str
-    """``mesh``, ``box``, ``sphere``, ``cylinder``, ``capsule`` or ``plane``."""
+    """``mesh``, ``box``, ``sphere``, ``cylinder`` or ``capsule``."""
     size: tuple[float, ...]
     """Scale (3,) of a mesh; sides (3,) of a box; radius of a sphere; radius and length of a cylinder or capsule; m."""
     file: str
@@ -58,24 +42,6 @@ class Visual(NamedTuple):
     rgba: tuple[float, ...]
     texture: str = ""
     """Picture that covers it instead of its own, see :mod:`.textures`; empty for none."""
-
-
-class RenderScene(Protocol):
-    @property
-    def bodies(self) -> Mapping[str, SceneBody]: ...
-    @property
-    def revision(self) -> int:
-        """Changes whenever bodies or their visual shapes do."""
-
-    @property
-    def look(self) -> Look:
-        """Light, shadows and background."""
-
-    def visuals(self, body: int) -> tuple[Visual, ...]:
-        """Return the visual shapes of the body with this id."""
-
-    def link_frames(self, links: Sequence[tuple[int, int]]) -> Array:
-        """Return the poses (N, 4, 4) in the world of the frames of links, each given as (body id, link)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,13 +200,6 @@ def _in_two_levels(radius: float, make: Callable[[int], Mesh]) -> Mesh:
     return replace(make(_SEGMENTS), coarse=coarse)
 
 
-def plane() -> Mesh:
-    """Return a large square in z = 0 that faces up."""
-    h = _PLANE_HALF
-    positions = np.array([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]])
-    return _white(positions, np.tile([0.0, 0, 1], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), closed=False)
-
-
 def _revolve(profile: Array, normals: Array, segments: int = _SEGMENTS) -> Mesh:
     """Return the surface of revolution around z of a profile (P, 2) of radius and height, from bottom to top."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
@@ -261,9 +220,9 @@ def _revolve(profile: Array, normals: Array, segments: int = _SEGMENTS) -> Mesh:
     return _white(positions, around(normals), faces[area > 1e-9 * area.max()])
 
 
-def _white(positions: Array, normals: Array, faces: NDArray[np.int64], closed: bool = True) -> Mesh:
+def _white(positions: Array, normals: Array, faces: NDArray[np.int64]) -> Mesh:
     white = np.full((len(positions), 4), 255, np.uint8)
-    return Mesh(positions.astype(np.float32), normals.astype(np.float32), white, faces.astype(np.uint32), closed=closed)
+    return Mesh(positions.astype(np.float32), normals.astype(np.float32), white, faces.astype(np.uint32))
 
 
 # --- parts of a body -------------------------------------------------------------------------------------------------
@@ -335,8 +294,6 @@ def _meshes_of(visual: Visual, load_mesh: Callable[[str], Sequence[Mesh]]) -> li
         ]
     if visual.kind == "box":
         return [box((size[0] / 2, size[1] / 2, size[2] / 2))]
-    if visual.kind == "plane":
-        return [plane()]
     if visual.kind == "sphere":
         return [sphere(size[0])]
     return [(cylinder if visual.kind == "cylinder" else capsule)(size[0], size[1])]

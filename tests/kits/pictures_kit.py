@@ -13,7 +13,6 @@ from engines_kit import need_engine
 from hal.drivers.scene.camera import choose_renderer
 from hal.drivers.scene.drawn import DrawnWorld
 from hal.drivers.scene.renderer import Renderer
-from hal.drivers.scene.shapes import RenderScene
 from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.registry import choose_engine
@@ -90,7 +89,7 @@ def look_at(eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, 
     return Pose.from_matrix(matrix)
 
 
-def renderer(name: str, scene: RenderScene) -> Renderer:
+def renderer(name: str, scene: DrawnWorld) -> Renderer:
     """A renderer by name; skips the test where there is no OpenGL, or no PyBullet."""
     try:
         return choose_renderer(scene, name)
