@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from . import registry
-from .errors import HalError
+from .errors import ControlTaken, HalError
 from .specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 if TYPE_CHECKING:
@@ -160,6 +160,8 @@ def _check(device: Device, duration: float) -> Iterator[CheckResult]:
             yield CheckResult(kind, "unknown", f"its driver {device.driver!r} has no check of its own")
             return
         yield from check(device, duration)
+    except ControlTaken as error:
+        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
     except (HalError, OSError) as error:
         yield CheckResult("check", "fail", f"{type(error).__name__}: {error}", "fix this first, then check again")
 

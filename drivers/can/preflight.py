@@ -10,7 +10,7 @@ import time
 from collections.abc import Generator, Iterator, Sequence
 from typing import NamedTuple
 
-from hal.errors import ConfigError, ControlTaken, DeviceNotFound
+from hal.errors import ConfigError, DeviceNotFound
 from hal.lock import DeviceLock
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
@@ -206,9 +206,6 @@ def _check_motors(chains: Sequence[DamiaoChain], bus: CanBus) -> _Steps:
     for chain in chains:
         try:
             chain.open()
-        except ControlTaken as error:
-            yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
-            return False
         except DeviceNotFound as error:
             yield _missing_motors(chain, bus, str(error))
             fits = False
@@ -401,8 +398,6 @@ def check_piper(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         link.open(reports.missing)
         yield CheckResult("motors", "ok", f"a PiPER reports on {settings.channel}, with all {JOINTS} joints")
         yield from _check_piper(spec, settings, link, reports, duration)
-    except ControlTaken as error:
-        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
     except DeviceNotFound as error:
         yield CheckResult("motors", "fail", reports.missing(), str(error).rpartition("; ")[2])
     finally:

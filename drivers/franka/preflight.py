@@ -11,7 +11,7 @@ from typing import Any
 
 from hal import registry
 from hal.clock import describe_load
-from hal.errors import ConnectionLost, ControlTaken, Fault
+from hal.errors import ConnectionLost, Fault
 from hal.host.process import Channel, Child, SharedMemory
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
@@ -59,11 +59,7 @@ _IMPROVE = "connect the cable directly to Control's LAN port, end busy programs,
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
     """Check one arm, and measure its network for ``duration`` s. Nothing moves, and no connection stays open."""
     settings = ArmSettings.of(spec)
-    try:
-        lock = lock_arm(settings.host)
-    except ControlTaken as error:
-        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
-        return
+    lock = lock_arm(settings.host)
     try:
         yield from _check(spec, settings, duration)
     finally:

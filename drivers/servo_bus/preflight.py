@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from time import monotonic, sleep
 
 from hal import registry
-from hal.errors import ConfigError, ControlTaken, HalError
+from hal.errors import ConfigError, ConnectionLost, DeviceNotFound
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 
@@ -54,9 +54,7 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
             yield CheckResult("adapter", "warn", f"it collects answers for {late} ms", remedy)
         yield from _check_ranges(arm)
         yield _check_answers(arm, max(duration, 0.2))
-    except ControlTaken as error:
-        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
-    except HalError as error:
+    except (ConfigError, ConnectionLost, DeviceNotFound) as error:
         for text in [one.message for one in error.problems] if isinstance(error, ConfigError) else [str(error)]:
             found, _, remedy = text.partition("; ")
             yield CheckResult("motors", "fail", found, remedy)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.errors import ConnectionLost, ControlTaken
+from hal.errors import ConnectionLost
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
 from hal.preflight import CheckResult, compare_payload, compare_tcp, measure_gaps
@@ -58,8 +58,6 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         yield _check_tcp(spec, settings, link.receive)
         yield _check_payload(settings, link)
         yield _check_states(spec, link, duration)
-    except ControlTaken as error:
-        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
     except ConnectionLost as error:
         fault = error.fault or NO_CONTROLLER
         yield CheckResult("controller", "fail", str(error), fault.remedy)

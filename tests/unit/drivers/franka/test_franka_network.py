@@ -24,6 +24,7 @@ from hal.drivers.franka.network import (
 )
 from hal.drivers.franka.preflight import check, rate_round_trips
 from hal.preflight import CheckResult
+from hal.preflight import preflight as check_rig
 from hal.specs import RobotSpec
 
 _PID = os.getpid()
@@ -67,10 +68,11 @@ def test_a_robot_that_accepts_and_never_answers_is_a_failure(monkeypatch: pytest
 def test_an_arm_that_another_program_uses_is_not_checked_further() -> None:
     lock = lock_arm(EMPTY)
     try:
-        (found,) = checked(rig()).values()
+        plan = load("franka_emulator", overrides=[f"robots.arm.real.host={EMPTY}"]).resolve()
+        (found,) = (one for one in check_rig(plan, 0.05, machine=False) if one.name.startswith("arm:"))
     finally:
         lock.release()
-    assert (found.name, found.level) == ("in use", "fail")
+    assert (found.name, found.level) == ("arm: in use", "fail")
     assert "robot" in checked(rig()), "the check releases its own lock"
 
 
