@@ -1,6 +1,6 @@
-"""Frames of Damiao motors: pure functions that encode commands and decode replies. No bus, no time.
+"""Frames of Damiao motors: pure functions that encode commands and read registers. No bus, no time.
 
-The motor's own side is in the emulator.
+Feedback is decoded by :class:`.damiao_motor.ChainMotor`. The motor's own side is in the emulator.
 
 A motor listens at its own id. Whatever it is sent, it answers with one feedback frame at its master id. Frames have
 8 bytes. In commands and feedback, numbers are unsigned integers of 12 or 16 bits, big-endian, that map linearly onto
@@ -119,24 +119,8 @@ INTEGER_REGISTERS = frozenset({*range(7, 11), *range(13, 17), 35, 36})
 """Registers that hold a uint32; the others hold a float32."""
 
 
-class MotorFeedback(NamedTuple):
-    """Content of a feedback frame, on the motor's side: without direction and offset of a joint."""
-
-    motor: int
-    """The lowest 4 bits of the motor's id."""
-    status: int
-    """See :class:`MotorStatus`; other values are not documented."""
-    q: float
-    dq: float
-    tau: float
-    mosfet: int
-    """Temperature of the MOSFETs, deg C."""
-    rotor: int
-    """Temperature of the rotor, deg C."""
-
-
 class MotorCodec:
-    """Encoder of the commands, and decoder of the feedback, of motors with one range.
+    """Encoder of the commands to motors with one range.
 
     Values beyond the range are clamped. A number is truncated to the next lower step, so zero is half a step below
     zero (0x7FFF, 0x7FF), and a value comes back at most one step lower.
@@ -149,7 +133,6 @@ class MotorCodec:
             raise ValueError(f"the ranges of a motor must be positive, not {limits}")
         self._p, self._v, self._t = p, v, t
         self._p2, self._v2, self._t2 = 2.0 * p, 2.0 * v, 2.0 * t
-        self._p_step, self._v_step, self._t_step = 2.0 * p / 65535.0, 2.0 * v / 4095.0, 2.0 * t / 4095.0
 
     def encode_command(self, q: float, dq: float, kp: float, kd: float, tau: float) -> bytes:
         """Return the data of a command: rad, rad/s, Nm/rad, Nm s/rad, Nm. Raises ValueError for NaN."""
@@ -160,26 +143,6 @@ class MotorCodec:
         stiffness = 4095 if kp >= KP_MAX else 0 if kp <= 0.0 else int(kp * 4095.0 / KP_MAX)
         damping = 4095 if kd >= KD_MAX else 0 if kd <= 0.0 else int(kd * 4095.0 / KD_MAX)
         return (position << 48 | velocity << 36 | stiffness << 24 | damping << 12 | torque).to_bytes(8, "big")
-
-    def decode_feedback(self, data: bytes | bytearray) -> MotorFeedback:
-        """Return the content of a feedback frame. Raises ValueError unless it has 8 bytes."""
-        bits = read_bits(data)
-        return MotorFeedback(
-            bits >> 56 & 15,
-            bits >> 60,
-            (bits >> 40 & 0xFFFF) * self._p_step - self._p,
-            (bits >> 28 & 0xFFF) * self._v_step - self._v,
-            (bits >> 16 & 0xFFF) * self._t_step - self._t,
-            bits >> 8 & 0xFF,
-            bits & 0xFF,
-        )
-
-
-def read_bits(data: bytes | bytearray) -> int:
-    """Return the 8 bytes of a frame as one number. Raises ValueError for another length."""
-    if len(data) != 8:
-        raise ValueError(f"a frame of a Damiao motor has 8 bytes, not {len(data)}")
-    return int.from_bytes(data, "big")
 
 
 # Registers. Requests and replies: id low, id high, operation, register, then its value in 4 bytes, little-endian.

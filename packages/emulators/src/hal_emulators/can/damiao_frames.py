@@ -14,7 +14,6 @@ from hal.drivers.can.damiao_protocol import (
     KP_MAX,
     READ_REGISTER,
     MotorCodec,
-    read_bits,
     unpack_register,
 )
 
@@ -47,11 +46,13 @@ class RegisterRequest(NamedTuple):
 
 
 class MotorSide(MotorCodec):
-    """The driver's codec, and the reverse: decoder of the commands, and encoder of the feedback."""
+    """The driver's encoder of commands, and what a motor does: decode them, and encode its feedback."""
 
     def decode_command(self, data: bytes | bytearray) -> MotorCommand:
         """Return the content of a command, which is none of the special forms (ENABLE, ...). Raises ValueError."""
-        bits, (p, v, t) = read_bits(data), self.limits
+        if len(data) != 8:
+            raise ValueError(f"a command has 8 bytes, not {len(data)}")
+        bits, (p, v, t) = int.from_bytes(data, "big"), self.limits
         return MotorCommand(
             (bits >> 48) * (2.0 * p / 65535.0) - p,
             (bits >> 36 & 0xFFF) * (2.0 * v / 4095.0) - v,
@@ -63,7 +64,7 @@ class MotorSide(MotorCodec):
     def encode_feedback(
         self, motor: int, status: int, q: float, dq: float, tau: float, mosfet: int = 30, rotor: int = 30
     ) -> bytes:
-        """Return the data of a feedback frame; arguments as in MotorFeedback. Raises ValueError for NaN."""
+        """Return the data of a feedback frame: rad, rad/s, Nm, and temperatures in deg C. Raises ValueError for NaN."""
         p, v, t = self.limits
         position = 65535 if q >= p else 0 if q <= -p else int((q + p) * 65535.0 / (2.0 * p))
         velocity = 4095 if dq >= v else 0 if dq <= -v else int((dq + v) * 4095.0 / (2.0 * v))
