@@ -281,14 +281,3 @@ def read_loopback(text: str) -> str:
         if ipaddress.IPv4Address(text).is_loopback:
             return text
     raise argparse.ArgumentTypeError(f"{text!r} is no address in 127.0.0.0/8")
-
-
-def read_words(line: str) -> list[str]:
-    """Return the words of a line, which may also be ``{"command": [WORD, ...]}``. Raises ValueError."""
-    if not line.startswith("{"):
-        return line.split()
-    message = json.loads(line)
-    words = message.get("command")
-    if not isinstance(words, list) or not words:
-        raise ValueError('expected {"command": ["word", ...]}')
-    return [str(word) for word in words]

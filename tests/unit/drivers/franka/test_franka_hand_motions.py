@@ -99,7 +99,7 @@ class Bench:
                 assert order.method == "move" or not holds, "a second grasp lets go, and so does homing"
                 status = self.fingers.start(motion_of(order))
             elif not self.deaf and self.fingers.motion is not None:
-                self.fingers.halt(False)
+                self.fingers.motion = None
                 status = HandStatus.ABORTED
         if self.now >= self._next_state:
             self._next_state += self.period

@@ -110,16 +110,6 @@ def test_homing_finds_the_width_unless_something_is_in_the_way():
     assert run(fingers, 3.0) is HandStatus.FAIL
 
 
-@pytest.mark.parametrize("release", [False, True])
-def test_a_halt_keeps_the_grip_unless_it_releases(release):
-    fingers = Fingers(object_width=0.03)
-    fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))
-    run(fingers, 1.0)
-    fingers.halt(release)
-    assert fingers.is_grasped is not release
-    assert (fingers.width > 0.03) is release
-
-
 @pytest.mark.parametrize("values", [(float("nan"), 0.1), (0.04, 0.0), (0.09, 0.1), (-0.01, 0.1)])
 def test_numbers_that_cannot_be_fail(values):
     assert Fingers().start(FingerMotion(FingerMotionKind.MOVE, *values)) is HandStatus.FAIL

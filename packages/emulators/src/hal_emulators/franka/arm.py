@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from hal.drivers.franka.flags import FLAGS
 from hal.drivers.franka.limits import ELBOW_FLIP, ArmLimits
+from hal.drivers.franka.link import ArmMode
 
 from .faults import SetpointReports, Unrest
 from .journal import Counters, Journal
@@ -25,14 +26,12 @@ from .motion import (
 )
 from .plant import Plant
 from .protocol import (
-    FLAG_COUNT,
     CommandPacket,
     ControllerMode,
     FrankaProtocol,
     Generator,
     GeneratorMode,
     RequestOutcome,
-    RobotMode,
     StatePacket,
 )
 from .settings import SETTERS, ClientSettings
@@ -108,17 +107,17 @@ class EmulatedArm:
     # State.
 
     @property
-    def mode(self) -> RobotMode:
+    def mode(self) -> ArmMode:
         """Mode in the state."""
         if self.stops.emergency:
-            return RobotMode.OTHER
+            return ArmMode.OTHER
         if self.stops.user:
-            return RobotMode.USER_STOPPED
+            return ArmMode.USER_STOPPED
         if self.errors:
-            return RobotMode.REFLEX
+            return ArmMode.REFLEX
         if self.stops.guiding:
-            return RobotMode.GUIDING
-        return RobotMode.IDLE if self.motion is None else RobotMode.MOVE
+            return ArmMode.GUIDING
+        return ArmMode.IDLE if self.motion is None else ArmMode.MOVE
 
     @property
     def modes(self) -> tuple[GeneratorMode, ControllerMode]:
@@ -268,7 +267,7 @@ class EmulatedArm:
 
     def move(self, number: int, options: MoveOptions) -> RequestOutcome | None:
         """Start a motion in the next cycle, or once the arm is at rest; return the outcome if it is refused."""
-        if self.motion is not None or self.mode is not RobotMode.IDLE:
+        if self.motion is not None or self.mode is not ArmMode.IDLE:
             return RequestOutcome.NOT_POSSIBLE
         self._refuse_pending()
         self._pending = (number, options)
@@ -364,7 +363,7 @@ class StateWriter:
         if flags != self._flags:
             self._flags = flags
             for name, raised in (("errors", arm.errors), ("reflex_reason", arm.last_errors)):
-                packet.put(name, [int(k in raised) for k in range(FLAG_COUNT)])
+                packet.put(name, [int(k in raised) for k in range(len(FLAGS))])
         packet.put("robot_mode", (arm.mode,))
         packet.put("control_command_success_rate", (motion.success_rate if motion is not None else 0.0,))
         return packet.spoilt(self.spoilt) if self.spoilt else packet.buffer

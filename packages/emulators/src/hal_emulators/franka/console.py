@@ -15,7 +15,6 @@ from hal_emulators.control import (
     between,
     make_commands,
     read_switch,
-    read_words,
     run_command,
     whole,
 )
@@ -40,7 +39,7 @@ class Executor:
 
     def execute_line(self, line: str) -> Answer:
         """Execute a command between two cycles of the server, and return its answer. Raises ValueError."""
-        words = read_words(line)
+        words = line.split()
         return self.server.call(lambda: self._execute(words))
 
     def _execute(self, words: Words) -> Answer:

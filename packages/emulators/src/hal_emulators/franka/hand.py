@@ -34,10 +34,7 @@ class HandFaults:
 
     version: int
     """Protocol that it claims to speak."""
-    temperature: int = 30
-    """Degrees Celsius."""
     stop_ignored: bool = False
-    stop_releases: bool = False
     silent_until: float = 0.0
     """End of a silence on the monotonic clock, s."""
     slow_reply: float = 0.0
@@ -48,6 +45,10 @@ class HandFaults:
 
 # The hand.
 
+_TEMPERATURE = 30
+"""That it reports, deg C."""
+_PERIOD = 0.02
+"""Time between two states, s."""
 _STEP = 0.01
 """s between two steps of moving fingers."""
 _WORLD_STEP = 0.004
@@ -62,30 +63,15 @@ class HandServer:
     """
 
     def __init__(
-        self,
-        host: str,
-        version: int = HAND_VERSION,
-        object_width: float | None = None,
-        period: float = 0.02,
-        homed: bool = True,
-        port: int = HAND_PORT,
-        world: ArmInWorld | None = None,
+        self, host: str, version: int = HAND_VERSION, homed: bool = True, world: ArmInWorld | None = None
     ) -> None:
-        """Build it.
-
-        Args:
-            object_width: Width of an object between the fingers, m.
-            period: Time between two states, s.
-            homed: False for a hand that was just switched on.
-            world: The simulated world that its arm is in, whose objects the fingers meet.
-        """
+        """Build it; one that is not ``homed`` was just switched on. ``world`` is the simulated world of its arm."""
         self.world = world
-        self.period = period
-        self.fingers = Fingers(object_width, homed)
+        self.fingers = Fingers(homed=homed)
         self.faults = HandFaults(version)
         self._requests = {code.name.lower(): 0 for code in HandCode}
         self._newest: dict[str, tuple[float, ...]] = {}
-        self.network = HandNetwork((host, port))
+        self.network = HandNetwork((host, HAND_PORT))
         self._lock = threading.RLock()
         self._ending = threading.Event()
         self._running: HandRequest | None = None
@@ -179,7 +165,7 @@ class HandServer:
             self.network.listen()
         self._advance()
         if now >= self._next_state:
-            self._next_state = max(now, self._next_state + self.period)
+            self._next_state = max(now, self._next_state + _PERIOD)
             if now >= self.faults.silent_until:
                 self.network.send_state(self._report(now))
         self.network.send_answers(now)
@@ -197,7 +183,7 @@ class HandServer:
     def _report(self, now: float) -> HandStatePacket:
         fingers = self.fingers
         clock = int((now - self._born) * 1e3)  # Franka's library interprets the number of a message as milliseconds
-        return HandStatePacket(clock, fingers.width, fingers.max_width, fingers.is_grasped, self.faults.temperature)
+        return HandStatePacket(clock, fingers.width, fingers.max_width, fingers.is_grasped, _TEMPERATURE)
 
     # Requests.
 
@@ -210,7 +196,7 @@ class HandServer:
             self._connect(request)
         elif request.code is HandCode.STOP:
             if not self.faults.stop_ignored:
-                self.fingers.halt(self.faults.stop_releases)
+                self.fingers.motion = None
                 self._end_motion(HandStatus.ABORTED)
             self._answer(request, HandStatus.SUCCESS)
         else:
@@ -257,24 +243,9 @@ _seconds = between(0.0, 1e6)
 HAND_COMMANDS = make_commands(
     Command("object W|none", "put an object of W m between the fingers, or remove it", _put),
     Command(
-        "grasp-ends-at-width on|off",
-        "a grasp that meets nothing ends at its width, or closes all the way (the default)",
-        assign("fingers.grasp_ends_at_width", read_switch),
-    ),
-    Command(
-        "unhome",
-        "undo the homing, as after switching on",
-        lambda hand, _: setattr(hand.fingers, "homed", False),
-    ),
-    Command(
         "stop-ignored on|off",
         "Stop is answered, but has no effect (libfranka, issue 18)",
         assign("faults.stop_ignored", read_switch),
-    ),
-    Command(
-        "stop-releases on|off",
-        "Stop ends the pressing force (libfranka, issue 111)",
-        assign("faults.stop_releases", read_switch),
     ),
     Command(
         "silence S",
@@ -288,7 +259,6 @@ HAND_COMMANDS = make_commands(
         lambda hand, words: setattr(hand.faults, "failures", int(read_number((words or ["1"])[0], 0, 1e6))),
     ),
     Command("version N", "claim to speak this protocol", assign("faults.version", whole(0, 65535))),
-    Command("temperature T", "report T degrees Celsius", assign("faults.temperature", whole(0, 65535))),
     Command("drop", "close the connection", lambda hand, _: hand.network.disconnect()),
     Command(
         "restart [S]",

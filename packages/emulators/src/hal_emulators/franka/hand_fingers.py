@@ -16,7 +16,6 @@ FULL_WIDTH = 0.08
 """Width of completely open fingers, m."""
 _SPEED_MAX = 0.1  # m/s of the width: 50 mm/s for each finger
 _OWN_SPEED = 0.1  # m/s, where no speed is given; assumption
-_SPRING = 0.002  # m by which fingers open when a stop removes their force; assumption
 _MOVE_FORCE = 20.0  # N
 _BLOCKED = 100.0  # s until a Move that meets an object is answered, as users report (franka_ros, issue 281)
 
@@ -86,13 +85,6 @@ class Fingers:
         """Switch off: no motion, no force, not homed. Assumption: the fingers keep their position."""
         self.motion, self.homed = None, False
         self.release()
-
-    def halt(self, release: bool) -> None:
-        """Stop; with ``release`` the force ends too, and the fingers spring back a little."""
-        self.motion = None
-        if release and self.is_grasped:
-            self.release()
-            self.width = min(FULL_WIDTH, self.width + _SPRING)
 
     def release(self) -> None:
         self.is_grasped, self.force = False, 0.0

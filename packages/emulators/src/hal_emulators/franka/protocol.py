@@ -16,24 +16,14 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
+from hal.drivers.franka.flags import FLAGS
+
 # Requests.
 
 PORT = 1337
 """TCP port, fixed in the client libraries."""
 HEADER = struct.Struct("<III")
 """Header of every request and response: code, number of the request, size with this header."""
-
-
-class RobotMode(IntEnum):
-    """``robot_mode`` of a state."""
-
-    OTHER = 0
-    IDLE = 1
-    MOVE = 2
-    GUIDING = 3
-    REFLEX = 4
-    USER_STOPPED = 5
-    RECOVERY = 6
 
 
 class Generator(IntEnum):
@@ -188,8 +178,6 @@ PROTOCOLS = {
 
 # Packets.
 
-FLAG_COUNT = 41
-
 
 class PacketField(NamedTuple):
     """One field: a number of values of one kind (a letter of :mod:`struct`), ``offset`` bytes from the start."""
@@ -273,8 +261,8 @@ def _state_layout(real: str, reals: Sequence[tuple[str, int]]) -> PacketLayout:
             *((name, count, real) for name, count in reals),
             ("motion_generator_mode", 1, "B"),
             ("controller_mode", 1, "B"),
-            ("errors", FLAG_COUNT, "B"),
-            ("reflex_reason", FLAG_COUNT, "B"),
+            ("errors", len(FLAGS), "B"),
+            ("reflex_reason", len(FLAGS), "B"),
             ("robot_mode", 1, "B"),
             ("control_command_success_rate", 1, real),
         ]

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 from typing import Any
 
+import numpy as np
+
 from .plant import FLANGE_TO_HAND, IDENTITY, Pose16, multiply
 
 Values = tuple[float, ...]
@@ -109,19 +111,11 @@ def _check_ranges(name: str, ranges: Sequence[tuple[float, float]]) -> Callable[
 
 def _rigid(name: str) -> Callable[[dict[str, Values]], str | None]:
     def check(parts: dict[str, Values]) -> str | None:
-        m = parts[name]
-        columns = [m[4 * k : 4 * k + 3] for k in range(3)]
-        if (m[3], m[7], m[11], m[15]) != (0.0, 0.0, 0.0, 1.0):
-            return f"the last row of {name} is not 0, 0, 0, 1"
-        for i in range(3):
-            for j in range(3):
-                product = sum(a * b for a, b in zip(columns[i], columns[j], strict=True))
-                if abs(product - (i == j)) > _ROTATION:
-                    return f"{name} is not a rigid transformation"
-        x, y, z = columns
-        across = (x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0])
-        if sum(a * b for a, b in zip(across, z, strict=True)) < 0.0:
-            return f"{name} is a reflection"
+        matrix = np.reshape(parts[name], (4, 4)).T
+        turn = matrix[:3, :3]
+        orthogonal = np.allclose(turn.T @ turn, np.eye(3), rtol=0.0, atol=_ROTATION)
+        if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0] or not orthogonal or np.linalg.det(turn) < 0.0:
+            return f"{name} is not a rigid transformation"
         return None
 
     return check
