@@ -13,10 +13,10 @@ from functools import cached_property
 from typing import Annotated, Any, Literal
 from zlib import crc32
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, model_validator
 
 from hal.config.files import DeviceSettings, find_closest
-from hal.config.schema import Flag, Quantity, Size, Strict, describe, is_number
+from hal.config.schema import Flag, Quantity, Several, Size, Strict, describe
 from hal.kinematics.inertials import find_wrong_inertials
 from hal.specs import GripperSpec, RobotSpec
 
@@ -64,30 +64,6 @@ def emulator_remedy(source: str) -> str:
 # Values.
 
 
-def _text(meaning: str) -> BeforeValidator:
-    def check(value: Any) -> str:
-        if not isinstance(value, str) or not value.strip():
-            raise ValueError(f"must be {meaning}, not {describe(value)}")
-        return value.strip()
-
-    return BeforeValidator(check)
-
-
-def _whole(meaning: str, least: int, most: int) -> BeforeValidator:
-    def check(value: Any) -> int:
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-            raise ValueError(f"must be {meaning}, {least} to {most} ({most:#x}), not {describe(value)}")
-        return value
-
-    return BeforeValidator(check)
-
-
-def _direction(value: Any) -> float:
-    if not is_number(value) or value not in (1, -1):
-        raise ValueError(f"must be 1 or -1, not {describe(value)}")
-    return float(value)
-
-
 def _motor_type(value: Any) -> str:
     if isinstance(value, str) and value in MOTOR_RANGES:
         return value
@@ -96,22 +72,8 @@ def _motor_type(value: Any) -> str:
     raise ValueError(f"there is no motor type {describe(value)}{hint}; types: {', '.join(MOTOR_RANGES)}")
 
 
-def _ranges(value: Any) -> Any:
-    if value is None:
-        return None
-    if not isinstance(value, (list, tuple)) or len(value) != 3 or not all(is_number(x) and x > 0 for x in value):
-        raise ValueError("must be three positive numbers: PMAX in rad, VMAX in rad/s and TMAX in Nm")
-    return MotorRange(*map(float, value))
-
-
-def _width_table(value: Any) -> Any:
-    rows = "rows [angle in rad, width in m]"
-    if not isinstance(value, (list, tuple)) or len(value) < 2:
-        raise ValueError(f"must be a list of at least two {rows}, not {describe(value)}")
-    for row in value:
-        if not isinstance(row, (list, tuple)) or len(row) != 2 or not all(map(is_number, row)):
-            raise ValueError(f"must be a list of {rows}; one row is {describe(row)}")
-    table = sorted((float(angle), float(width)) for angle, width in value)
+def _check_widths(rows: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    table = sorted(rows)
     steps = [(second[0] - first[0], second[1] - first[1]) for first, second in itertools.pairwise(table)]
     if not all(angle > 0.0 for angle, _ in steps):
         raise ValueError("has the same angle twice")
@@ -122,16 +84,18 @@ def _width_table(value: Any) -> Any:
     return tuple(table)
 
 
-Id = Annotated[int, _whole("an 11-bit id", 0, _LARGEST_ID)]
-MotorId = Annotated[int, _whole("a motor's id", 1, _LARGEST_MOTOR_ID)]
-BitRate = Annotated[int, _whole("a bit rate in bit/s", 10_000, 10_000_000)]
+Text = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
+_RANGES = Several(Quantity("", 0.0, 1e4, above=True), 3, "PMAX in rad, VMAX in rad/s, TMAX in Nm")
+Id = Annotated[int, Field(ge=0, le=_LARGEST_ID, strict=True)]
+MotorId = Annotated[int, Field(ge=1, le=_LARGEST_MOTOR_ID, strict=True)]
+BitRate = Annotated[int, Field(ge=10_000, le=10_000_000, strict=True)]
 Angle = Annotated[float, Quantity("rad", -100.0, 100.0)]
 Stiffness = Annotated[float, Quantity("Nm/rad", 0.0, KP_MAX, above=True)]
 Damping = Annotated[float, Quantity("Nm s/rad", 0.0, KD_MAX, above=True)]
 Friction = Annotated[float, Quantity("Nm", 0.0, 10.0)]
 Temperature = Annotated[float, Quantity("deg C", 30.0, 200.0)]
 FollowingLimit = Annotated[float, Quantity("rad", 0.05, 3.0)]
-WidthTable = Annotated[tuple[tuple[float, float], ...], BeforeValidator(_width_table)]
+WidthTable = Annotated[tuple[tuple[float, float], ...], Field(min_length=2), AfterValidator(_check_widths)]
 
 
 # Records.
@@ -140,8 +104,10 @@ WidthTable = Annotated[tuple[tuple[float, float], ...], BeforeValidator(_width_t
 class BusSettings(DeviceSettings):
     """A CAN bus, as python-can opens it."""
 
-    interface: Annotated[str, _text("an interface of python-can, for example socketcan")]
-    channel: Annotated[str, _text("a channel of the interface, for example can0")]
+    interface: Text
+    """An interface of python-can, for example ``socketcan``."""
+    channel: Text
+    """A channel of the interface, for example ``can0``."""
     fd: Flag = False
     """Whether frames are sent as CAN-FD, with the faster bit rate for their data."""
     bus: dict[str, Any] = Field(default_factory=dict)
@@ -199,7 +165,7 @@ class DamiaoMotorSettings(Strict):
     """Gain of the position, Nm/rad."""
     kd: Damping
     """Gain of the velocity, Nm s/rad."""
-    direction: Annotated[float, BeforeValidator(_direction)] = 1.0
+    direction: Literal[1, -1] = 1
     """1 if the joint turns in the motor's direction, -1 if in the opposite one."""
     offset: Angle = 0.0
     """Position of the joint at the motor's zero, rad: joint = direction * motor + offset."""
@@ -207,7 +173,7 @@ class DamiaoMotorSettings(Strict):
     """Coulomb friction of the joint that a command adds in the direction of its motion, Nm: less than there is."""
     master: Id | None = None
     """Id that the motor answers with (its register MST_ID); the motor's id + 0x10 if it is left out."""
-    ranges: Annotated[MotorRange | None, BeforeValidator(_ranges)] = None
+    ranges: Annotated[MotorRange, _RANGES] | None = None
     """PMAX, VMAX and TMAX of this motor, rad, rad/s and Nm, if they are not those of its type."""
 
     @property
@@ -260,7 +226,7 @@ class DamiaoGripperSettings(BusSettings):
 class PiperArmSettings(BusSettings):
     """Settings under ``real:`` of a PiPER."""
 
-    speed_percent: Annotated[int, _whole("a percentage", 1, 100)] = 100
+    speed_percent: Annotated[int, Field(ge=1, le=100, strict=True)] = 100
     """Speed at which the arm's own controller goes to a target, percent of each joint's largest. It must not be below
     the speed of the set-points, or the arm lags behind."""
     mounting: Literal["upright", "left", "right"] | None = None

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from hal.config.files import DeviceSettings
 from hal.config.models import UNITS
-from hal.config.schema import Host, Offset, PoseConfig, Size, Strict, ValueProblem, describe, is_number
+from hal.config.schema import Host, Offset, PoseConfig, Quantity, Several, Size, Strict, ValueProblem, is_number
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import Floats, GripperSpec, RobotSpec
 
@@ -26,29 +26,20 @@ _NO_ADDRESS = (
 )
 
 
-def _check_each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
-    """Check for as many numbers as there are ranges (lowest, highest), each within its own."""
-
-    def check(value: Any) -> tuple[float, ...]:
-        size = f"{len(ranges)} numbers ({meaning})"
-        if not isinstance(value, (list, tuple)) or len(value) != len(ranges):
-            raise ValueProblem(f"must be a list of {size}, not {describe(value)}", "wrong_count")
-        for k, (item, (lowest, highest)) in enumerate(zip(value, ranges, strict=True)):
-            if not is_number(item) or not lowest <= item <= highest:
-                message = f"must be {size}; item {k + 1} is {describe(item)}, outside {lowest:g} to {highest:g}"
-                raise ValueProblem(message, "out_of_range")
-        return tuple(float(item) for item in value)
-
-    return BeforeValidator(check)
+def _check_stiffness(values: Floats) -> Floats:
+    if min(values[:3]) < 10.0 or max(values[3:]) > 300.0:
+        raise ValueProblem("must be 10 to 3000 N/m for x, y, z, and 1 to 300 Nm/rad for the angles", "out_of_range")
+    return values
 
 
 _ANY = 1e4
 """Largest threshold, Nm or N. One beyond every force of the arm switches the detection off."""
-Torques = Annotated[Floats, _check_each("Nm, one for each joint", *[(0.0, _ANY)] * 7)]
-Forces = Annotated[Floats, _check_each("x, y, z in N, then roll, pitch, yaw in Nm", *[(0.0, _ANY)] * 6)]
-JointStiffness = Annotated[Floats, _check_each("Nm/rad, one for each joint", *[(0.0, 14250.0)] * 7)]
+_SIX = "x, y, z, then roll, pitch, yaw"
+Torques = Annotated[Floats, Several(Quantity("Nm", 0.0, _ANY), 7, "one for each joint")]
+Forces = Annotated[Floats, Several(Quantity("N, or Nm", 0.0, _ANY), 6, _SIX)]
+JointStiffness = Annotated[Floats, Several(Quantity("Nm/rad", 0.0, 14250.0), 7, "one for each joint")]
 CartesianStiffness = Annotated[
-    Floats, _check_each("x, y, z in N/m, then roll, pitch, yaw in Nm/rad", *[(10.0, 3000.0)] * 3, *[(1.0, 300.0)] * 3)
+    Floats, Several(Quantity("N/m, or Nm/rad", 1.0, 3000.0), 6, _SIX), AfterValidator(_check_stiffness)
 ]
 
 
@@ -114,9 +105,7 @@ class LoadSetting(Strict):
     """Mass, kg; the data sheets of both arms give a payload of 3 kg."""
     com: Offset = (0.0, 0.0, 0.0)
     """Centre of mass in the frame of the flange, m."""
-    inertia: Annotated[
-        Floats, _check_each("xx, yy, zz, xy, xz, yz in kg m2", *[(0.0, 10.0)] * 3, *[(-10.0, 10.0)] * 3)
-    ] = (0.0,) * 6
+    inertia: Annotated[Floats, Several(Quantity("kg m2", -10.0, 10.0), 6, "xx, yy, zz, xy, xz, yz")] = (0.0,) * 6
     """Moments and products about the centre of mass, kg m2."""
 
     @model_validator(mode="after")

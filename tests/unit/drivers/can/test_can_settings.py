@@ -60,18 +60,18 @@ def test_a_valid_arm_and_gripper_have_no_problems() -> None:
         ({1: {"master": 0x11}}, "real.motors.1.master", "id_collision"),
         ({1: {"master": 3}}, "real.motors.1.master", "id_collision"),
         ({1: {"master": 2}}, "real.motors.1.master", "id_collision"),
-        ({0: {"id": 0}}, "real.motors.0.id", "invalid"),
-        ({0: {"id": 0x200}}, "real.motors.0.id", "invalid"),
-        ({0: {"id": True}}, "real.motors.0.id", "invalid"),
+        ({0: {"id": 0}}, "real.motors.0.id", "out_of_range"),
+        ({0: {"id": 0x200}}, "real.motors.0.id", "out_of_range"),
+        ({0: {"id": True}}, "real.motors.0.id", "wrong_type"),
         ({0: {"type": "DM4341"}}, "real.motors.0.type", "invalid"),
-        ({0: {"direction": 0}}, "real.motors.0.direction", "invalid"),
-        ({0: {"direction": -2}}, "real.motors.0.direction", "invalid"),
+        ({0: {"direction": 0}}, "real.motors.0.direction", "invalid_choice"),
+        ({0: {"direction": -2}}, "real.motors.0.direction", "invalid_choice"),
         ({0: {"kp": 501.0}}, "real.motors.0.kp", "out_of_range"),
         ({0: {"kp": 0.0}}, "real.motors.0.kp", "out_of_range"),
         ({0: {"kd": 5.1}}, "real.motors.0.kd", "out_of_range"),
         ({0: {"kd": 0}}, "real.motors.0.kd", "out_of_range"),
         ({0: {"ranges": [12.5, 45.0, 54.0]}}, "real.motors.0", "invalid"),
-        ({0: {"ranges": [12.5, 8.0]}}, "real.motors.0.ranges", "invalid"),
+        ({0: {"ranges": [12.5, 8.0]}}, "real.motors.0.ranges", "wrong_count"),
         ({0: {"offset": 11.0}}, "real.motors.0.offset", "out_of_range"),
         ({0: {"torque": 1}}, "real.motors.0.torque", "unknown_key"),
     ],
@@ -127,7 +127,8 @@ def test_ids_of_arm_and_gripper_on_one_bus_may_not_collide() -> None:
     ],
 )
 def test_wrong_tables_of_widths_are_refused(widths: Any) -> None:
-    assert [found[0] for found in check_damiao_gripper(gripper(widths=widths))] == ["real.widths"]
+    keys = {".".join(found[0].split(".")[:2]) for found in check_damiao_gripper(gripper(widths=widths))}
+    assert keys == {"real.widths"}
 
 
 @pytest.mark.parametrize("option", ["interface", "channel", "motors"])
