@@ -69,7 +69,7 @@ class ChainMotor:
         """The motor in words, with its joint and its id."""
         self.codec = MotorCodec(settings.limits)
         self.id, self.kp, self.kd = settings.id, settings.kp, settings.kd
-        self.direction, self.offset = settings.direction, settings.offset
+        self.direction, self.offset = float(settings.direction), settings.offset
         p, v, t = settings.limits
         self._q_step = self.direction * 2.0 * p / 65535.0
         self._q_0 = self.offset - self.direction * p + 0.5 * self._q_step

@@ -253,7 +253,7 @@ def software_realsense() -> Iterator[CameraBench]:
 
 def recording(folder: Path) -> str:
     """Write a recording of two seconds, and return its path."""
-    from hal_emulators.realsense import write_recording
+    from realsense_kit import write_recording
 
     file = folder / "recorded.db3"
     write_recording(file, _realsense_spec(), 60)

@@ -20,8 +20,9 @@ from hal.types import Frame
 
 pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install 'robot-hal[realsense]'")
 
+from realsense_kit import write_recording
+
 from hal.drivers.realsense.camera import RealSenseCamera
-from hal_emulators.realsense import write_recording
 from hal_emulators.realsense.pictures import EmulatedImages, make_streams
 
 SIZE = (640, 480)

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from .camera import SoftwareCamera
 from .device import emulated_context
-from .feeder import write_recording
 from .pictures import read_number
 from .settings import CameraFaults, Emulation
 
-__all__ = ["CameraFaults", "Emulation", "SoftwareCamera", "emulated_context", "read_number", "write_recording"]
+__all__ = ["CameraFaults", "Emulation", "SoftwareCamera", "emulated_context", "read_number"]
