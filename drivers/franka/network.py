@@ -7,12 +7,13 @@ this computer.
 
 from __future__ import annotations
 
-import ipaddress
+import json
 import math
 import os
 import select
 import socket
 import struct
+import subprocess
 import threading
 import time
 from collections.abc import Sequence
@@ -83,37 +84,14 @@ def probe_port(address: str, port: int, timeout: float = 1.0) -> PortState:
     return PortState.OPEN
 
 
-def route_to(address: str, root: Path = Path("/")) -> Route | None:
-    """Return the route to an IPv4 address from the kernel's table; None if it cannot be read."""
-    if _is_own(address):
-        return Route("lo", None, False)
+def route_to(address: str, interfaces: Path = Path("/sys/class/net")) -> Route | None:
+    """Return the kernel's route to an IPv4 address; None if ``ip`` does not tell it."""
     try:
-        lines = (root / "proc/net/route").read_text().splitlines()[1:]
-    except OSError:
+        done = subprocess.run(["ip", "-json", "route", "get", address], capture_output=True, timeout=3.0, check=True)
+        found = json.loads(done.stdout)[0]
+    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
         return None
-    target, best, narrowest = int(ipaddress.IPv4Address(address)), None, -1
-    for line in lines:
-        interface, destination, gateway, _, _, _, _, mask = line.split()[:8]
-        if target & _number(mask) == _number(destination) and _number(mask) > narrowest:
-            narrowest = _number(mask)
-            router = None if _number(gateway) == 0 else str(ipaddress.IPv4Address(_number(gateway)))
-            best = Route(interface, router, (root / "sys/class/net" / interface / "wireless").exists())
-    return best
-
-
-def _is_own(address: str) -> bool:
-    """Return whether an address is this computer's; no packet is sent."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect((address, 9))
-        except OSError:
-            return False
-        return probe.getsockname()[0] == address or ipaddress.ip_address(address).is_loopback
-
-
-def _number(text: str) -> int:
-    """Convert an address of the kernel's table, which is printed in native byte order."""
-    return int(struct.unpack("=I", struct.pack("!I", int(text, 16)))[0])
+    return Route(found["dev"], found.get("gateway"), (interfaces / found["dev"] / "wireless").exists())
 
 
 # Round trips.

@@ -99,7 +99,7 @@ def _check_route(host: str, address: str) -> CheckResult:
     route = route_to(address)
     named = address if host == address else f"{host} is {address}"
     if route is None:
-        return CheckResult("route", "unknown", f"{named}; the route of packets cannot be read from Linux")
+        return CheckResult("route", "unknown", f"{named}; `ip route get` tells no route there")
     direct = "give a network port of this computer an address in the robot's network, and connect the two directly"
     if route.interface == "lo":
         return CheckResult("route", "ok", f"{named}, this computer: an emulator")

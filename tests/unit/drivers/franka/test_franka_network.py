@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,20 +133,25 @@ def test_host_names_are_resolved() -> None:
     assert resolve_host("x" * 70) is None
 
 
-def test_the_route_is_read_from_the_kernels_table(tmp_path: Path) -> None:
-    (tmp_path / "proc/net").mkdir(parents=True)
-    (tmp_path / "proc/net/route").write_text(
-        "Iface Destination Gateway Flags RefCnt Use Metric Mask MTU Window IRTT\n"
-        "wlan0 00000000 0101A8C0 0003 0 0 600 00000000 0 0 0\n"
-        "eth0 000010AC 00000000 0001 0 0 100 00FFFFFF 0 0 0\n"
-        "wlan0 0001A8C0 00000000 0001 0 0 600 00FFFFFF 0 0 0\n"
-    )
-    (tmp_path / "sys/class/net/wlan0/wireless").mkdir(parents=True)
+def test_the_route_is_the_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert route_to("127.0.5.1") == Route("lo", None, False)
+    answers = {
+        "172.16.0.2": '[{"dst":"172.16.0.2","dev":"eth0","prefsrc":"172.16.0.1","flags":[],"uid":0,"cache":[]}]',
+        "192.168.1.7": '[{"dst":"192.168.1.7","dev":"wlan0","prefsrc":"192.168.1.2","flags":[],"uid":0,"cache":[]}]',
+        "172.16.1.2": '[{"dst":"172.16.1.2","gateway":"192.168.1.1","dev":"wlan0","flags":[],"uid":0,"cache":[]}]',
+    }
+
+    def run(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        if words[-1] not in answers:  # as without a network that leads there
+            raise subprocess.CalledProcessError(2, words)
+        return subprocess.CompletedProcess(words, 0, answers[words[-1]])
+
+    monkeypatch.setattr(subprocess, "run", run)
+    (tmp_path / "wlan0/wireless").mkdir(parents=True)
     assert route_to("172.16.0.2", tmp_path) == Route("eth0", None, False)
     assert route_to("192.168.1.7", tmp_path) == Route("wlan0", None, True)
     assert route_to("172.16.1.2", tmp_path) == Route("wlan0", "192.168.1.1", True)
-    assert route_to("172.16.0.2", tmp_path / "nothing") is None
-    assert route_to("127.0.5.1", tmp_path) == Route("lo", None, False)
+    assert route_to("203.0.113.1", tmp_path) is None
 
 
 def may_ping() -> bool:
