@@ -59,29 +59,10 @@ _DESK = "change that motion where it was created, in Desk; this driver starts no
 _FREE = "move the arm free by hand with the guiding buttons"
 _CONTACT = f"{_FREE}; if there was no contact, set the load (real: load) or raise real: collision_behavior"
 
-_CARTESIAN = {
-    "cartesian_position_motion_generator_start_pose_invalid": (
-        "the first commanded pose was too far from the hand's pose"
-    ),
-    "cartesian_position_motion_generator_invalid_frame": "a commanded pose is not a valid transformation",
-    "cartesian_motion_generator_velocity_limits_violation": "a commanded pose was faster than the hand's limit",
-    "cartesian_motion_generator_velocity_discontinuity": "the velocity of the commanded poses jumped",
-    "cartesian_motion_generator_acceleration_discontinuity": "the acceleration of the commanded poses jumped",
-    "cartesian_motion_generator_joint_position_limits_violation": "a commanded pose needs a joint beyond its limit",
-    "cartesian_motion_generator_joint_velocity_limits_violation": (
-        "a commanded pose needs a joint faster than its limit"
-    ),
-    "cartesian_motion_generator_joint_velocity_discontinuity": "the commanded poses make the velocity of a joint jump",
-    "cartesian_motion_generator_joint_acceleration_discontinuity": (
-        "the commanded poses make the acceleration of a joint jump"
-    ),
-    "cartesian_motion_generator_elbow_limit_violation": "the commanded elbow is beyond its limit",
-    "cartesian_motion_generator_elbow_sign_inconsistent": "the commanded elbow is on both sides at once",
-    "cartesian_motion_generator_start_elbow_invalid": (
-        "the first commanded elbow angle was too far from the elbow's angle"
-    ),
-}
-"""Cause of each flag that only set-points of another program raise."""
+_CARTESIAN = [
+    name for name in FLAGS if name.startswith(("cartesian_motion_generator", "cartesian_position_motion_generator"))
+]
+"""Flags that only set-points of another program raise."""
 
 FLAG_TEXTS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
@@ -168,7 +149,7 @@ FLAG_TEXTS: Mapping[str, tuple[str, str]] = MappingProxyType(
             f"{_LATE}; in torque mode, change torques gradually",
         ),
         # Cartesian set-points: those of another program.
-        **{name: (cause, _OTHER) for name, cause in _CARTESIAN.items()},
+        **{name: (f"a Cartesian set-point was refused: {name.replace('_', ' ')}", _OTHER) for name in _CARTESIAN},
         # Motions that the robot plans, started in Desk.
         "max_goal_pose_deviation_violation": (
             "a motion from Desk did not end at its goal",
