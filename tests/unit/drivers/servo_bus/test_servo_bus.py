@@ -322,7 +322,7 @@ def test_late_answers_are_of_the_time_of_their_question_and_keep_the_arm_going(
         if k == 20:
             arm.far.execute("error 3 32")
         arm.far.advance(0.0)  # it has heard the question
-        wait_until(lambda: not line._late, "the answers have come")
+        wait_until(lambda: not line._waiting, "the answers have come")
     assert {*ages[1:]} == ({1} if arm.far.spec.model == "so101" else {1, 2}), "a ViperX is also asked for its status"
     assert not any(faults[:20])
     assert [fault.code for fault in faults if fault is not None][:1] == ["overload"]
