@@ -58,7 +58,7 @@ TORQUE_PER_AMPERE = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)
 
 STOP_ID, MODE_ID, TARGETS_ID, GRIPPER_ID = 0x150, 0x151, 0x155, 0x159
 ENABLE_ID, LIMIT_QUERY_ID, LIMITS_ID, JOINT_ID = 0x471, 0x472, 0x473, 0x475
-PARAMETER_QUERY_ID, ACCELERATION_ID, STROKE_ID = 0x477, 0x47C, 0x47E
+PARAMETER_QUERY_ID, STROKE_ID = 0x477, 0x47E
 STATUS_ID, POSE_ID, ANGLES_ID, GRIPPER_STATUS_ID, MOTION_ID, MOTOR_STATUS_ID = 0x2A1, 0x2A2, 0x2A5, 0x2A8, 0x251, 0x261
 ACKNOWLEDGEMENT = 0x476
 """Id of the answer to a command with an id of 0x470 and above."""
@@ -84,7 +84,7 @@ FEEDBACK_IDS = (
 GRIPPER_IDS = (GRIPPER_STATUS_ID,)
 """Those of them that are the gripper's."""
 
-PARAMETER_IDS = (LIMITS_ID, ACCELERATION_ID, STROKE_ID, ACKNOWLEDGEMENT, FIRMWARE)
+PARAMETER_IDS = (LIMITS_ID, STROKE_ID, ACKNOWLEDGEMENT, FIRMWARE)
 """Ids of the answers to questions and settings."""
 
 MILLIDEGREES = 180_000.0 / pi
@@ -160,15 +160,13 @@ class EnableRequest(NamedTuple):
 
 
 class LimitQuery(NamedTuple):
-    """Question for a joint's limits (0x472), answered by :class:`JointLimits` or :class:`AccelerationLimit`."""
+    """Question for a joint's range and speed (0x472), answered by :class:`JointLimits`."""
 
     motor: int
     """1 to 6."""
-    content: int = 1
-    """1 range and speed, 2 acceleration."""
 
     def frame(self) -> CanFrame:
-        return LIMIT_QUERY_ID, bytes((*self, 0, 0, 0, 0, 0, 0))
+        return LIMIT_QUERY_ID, bytes((self.motor, 1, 0, 0, 0, 0, 0, 0))
 
 
 class JointRequest(NamedTuple):

@@ -32,7 +32,6 @@ from hal.drivers.can.piper_protocol import (
     decode_feedback,
 )
 from hal_emulators.can.piper_frames import (
-    AccelerationLimit,
     Acknowledgement,
     EmergencyRequest,
     PoseNumbers,
@@ -57,7 +56,7 @@ COMMANDS = [
     (GripperRequest(-0.001, 0.0, clear_error=True), 0x159, "fffffc1800000300"),
     (EnableRequest(), 0x471, "0702000000000000"),
     (EnableRequest(255, False), 0x471, "ff01000000000000"),
-    (LimitQuery(3, 2), 0x472, "0302000000000000"),
+    (LimitQuery(3), 0x472, "0301000000000000"),
     (JointRequest(), 0x475, "0700007fffae0000"),
     (JointRequest(2, clear_error=False, set_zero=True), 0x475, "02ae007fff000000"),
     (ParameterQuery(), 0x477, "0400000003000000"),
@@ -79,7 +78,6 @@ FEEDBACK = [
     (JointStatus(5, 0.0, -10, 127, 0xFF, 65.535), 0x266, "0000fff67fffffff"),
     (JointLimits(2, pi, 0.0, 3.0), 0x473, "02070800000bb800"),
     (JointLimits(3, 0.0, radians(-170), 3.0), 0x473, "030000f95c0bb800"),
-    (AccelerationLimit(6, 5.0), 0x47C, "0613880000000000"),
     (Acknowledgement(0x71), 0x476, "7100000000000000"),
     (Acknowledgement(0x75, True), 0x476, "7501000000000000"),
     (GripperStroke(70, 100, 1), 0x47E, "6446010000000000"),
@@ -95,7 +93,7 @@ def same(one: Any, other: Any) -> bool:
     )
 
 
-UNREAD = (PoseNumbers, AccelerationLimit, Acknowledgement)
+UNREAD = (PoseNumbers, Acknowledgement)
 """What the driver does not read."""
 
 
@@ -183,7 +181,7 @@ def sdk_message(record: Any, messages: Any) -> tuple[str, Any]:
         command = transmit.ArmMsgMotorEnableDisableConfig(record.motor, flag)
         return "PiperMsgMotorEnableDisableConfig", ("arm_motor_enable", command)
     if isinstance(record, LimitQuery):
-        command = transmit.ArmMsgSearchMotorMaxAngleSpdAccLimit(*record)
+        command = transmit.ArmMsgSearchMotorMaxAngleSpdAccLimit(record.motor, 1)
         return "PiperMsgSearchMotorMaxAngleSpdAccLimit", ("arm_search_motor_max_angle_spd_acc_limit", command)
     if isinstance(record, JointRequest):
         zero, clear = (0xAE if flag else 0 for flag in (record.set_zero, record.clear_error))
@@ -242,9 +240,6 @@ def numbers_of(record: Any, message: Any) -> tuple[list[float], list[float]]:
         motor = message.arm_feedback_current_motor_angle_limit_max_spd
         ours = [record.motor, *(angle * 1800 / pi for angle in record[1:3]), record.velocity * 1e3]
         return ours, [motor.motor_num, motor.max_angle_limit, motor.min_angle_limit, motor.max_joint_spd]
-    if isinstance(record, AccelerationLimit):
-        motor = message.arm_feedback_current_motor_max_acc_limit
-        return [record.motor, record.acceleration * 1e3], [motor.joint_motor_num, motor.max_joint_acc]
     if isinstance(record, Acknowledgement):
         answer = message.arm_feedback_resp_set_instruction
         return [*map(int, record)], [answer.instruction_index, answer.is_set_zero_successfully]

@@ -249,18 +249,18 @@ class EmulatedDamiaoArm:
         fingers = {} if self.gripper is None else {"gripper": {"q": self.gripper.q, "tau": self.gripper.tau}}
         return {"motors": motors, **fingers}
 
-    # Faults.
+    # Faults. The number is one of ``numbers``.
 
     def set_status(self, number: int, status: int) -> None:
         """Give a motor a status, a fault for example; it lasts until the motor's error is cleared."""
         if status not in tuple(MotorStatus):
             known = ", ".join(f"{code:X} {code.name.lower()}" for code in MotorStatus)
             raise ValueError(f"there is no status {status:X}; statuses: {known}")
-        self._motor(number).status = MotorStatus(status)
+        self.motors[number].status = MotorStatus(status)
 
     def set_register(self, number: int, name: str, value: float) -> None:
         """Change a register of a motor."""
-        motor = self._motor(number)
+        motor = self.motors[number]
         register = MotorRegister.__members__.get(name.upper())
         if register is None:
             raise ValueError(f"there is no register {name!r}; registers: {', '.join(MotorRegister.__members__)}")
@@ -268,7 +268,7 @@ class EmulatedDamiaoArm:
         motor.set_ranges()
 
     def set_temperature(self, number: int, mosfet: int, rotor: int) -> None:
-        motor = self._motor(number)
+        motor = self.motors[number]
         motor.mosfet, motor.rotor = mosfet, rotor
 
     def restart(self) -> None:
@@ -292,8 +292,3 @@ class EmulatedDamiaoArm:
     @property
     def numbers(self) -> Sequence[int]:
         return tuple(self.motors)
-
-    def _motor(self, number: int) -> DamiaoMotor:
-        if number not in self.motors:
-            raise ValueError(f"there is no motor {number}; motors: {', '.join(map(str, self.motors))}")
-        return self.motors[number]

@@ -40,7 +40,6 @@ from hal.specs import RobotSpec
 from hal_emulators.shared_world import ArmInWorld
 
 from .piper_frames import (
-    AccelerationLimit,
     Acknowledgement,
     EmergencyRequest,
     decode_command,
@@ -134,14 +133,9 @@ class EmulatedPiperArm:
                 self.status, self.control = 0, STANDBY
             case JointRequest(clear_error=True):
                 self.status, self.flags = 0, [0] * JOINTS
-            case LimitQuery(motor, content) if 1 <= motor <= JOINTS:
-                k = motor - 1
-                answer = (
-                    AccelerationLimit(motor, 5.0)
-                    if content == 2
-                    else JointLimits(motor, self.plant.upper[k], self.plant.lower[k], _SPEED)
-                )
-                send(*encode_report(answer), 0)
+            case LimitQuery(motor) if 1 <= motor <= JOINTS:
+                upper, lower = self.plant.upper[motor - 1], self.plant.lower[motor - 1]
+                send(*encode_report(JointLimits(motor, upper, lower, _SPEED)), 0)
             case ParameterQuery(content=4):
                 send(*encode_report(GripperStroke(round(self._stroke * 1e3))), 0)
             case FirmwareQuery():
@@ -259,10 +253,10 @@ class EmulatedPiperArm:
         if number == 0:
             self.status = status
         else:
-            self.flags[self._joint(number)] = status
+            self.flags[number - 1] = status
 
     def set_temperature(self, number: int, driver: int, motor: int) -> None:
-        self._temperatures[self._joint(number)] = (driver, motor)
+        self._temperatures[number - 1] = (driver, motor)
 
     def set_object(self, width: float | None) -> None:
         """Put an object of this width, m, between the fingers; None takes it away."""
@@ -274,8 +268,3 @@ class EmulatedPiperArm:
     @property
     def numbers(self) -> Sequence[int]:
         return range(1, JOINTS + 1)
-
-    def _joint(self, number: int) -> int:
-        if not 1 <= number <= JOINTS:
-            raise ValueError(f"no joint {number}; joints: 1 to {JOINTS}")
-        return number - 1

@@ -60,15 +60,6 @@ class PoseNumbers(NamedTuple):
     """m, exact to a micrometre, and rad, exact to 0.001 degrees."""
 
 
-class AccelerationLimit(NamedTuple):
-    """Acceleration of a joint as set in the arm (0x47C)."""
-
-    motor: int
-    """1 to 6."""
-    acceleration: float
-    """rad/s2, exact to 0.001."""
-
-
 class Acknowledgement(NamedTuple):
     """Answer to a command with an id of 0x470 and above (0x476)."""
 
@@ -88,7 +79,7 @@ _COMMANDS: dict[int, Callable[[int, bytes], PiperCommand | EmergencyRequest | No
     protocol.MODE_ID: lambda _, data: ModeRequest(*data[:6]),
     protocol.GRIPPER_ID: lambda _, data: _gripper_request(*struct.unpack(">iHBB", data)),
     protocol.ENABLE_ID: lambda _, data: EnableRequest(data[0], data[1] == 2) if data[1] in (1, 2) else None,
-    protocol.LIMIT_QUERY_ID: lambda _, data: LimitQuery(*data[:2]),
+    protocol.LIMIT_QUERY_ID: lambda _, data: LimitQuery(data[0]) if data[1] == 1 else None,
     protocol.JOINT_ID: lambda _, data: JointRequest(data[0], data[5] == SET, data[1] == SET),
     protocol.PARAMETER_QUERY_ID: lambda _, data: ParameterQuery(data[0]),
     FIRMWARE: lambda _, data: FirmwareQuery() if (FIRMWARE, data) == FirmwareQuery().frame() else None,
@@ -102,7 +93,7 @@ def _gripper_request(width: int, torque: int, code: int, zero: int) -> GripperRe
     return GripperRequest(width * 1e-6, torque * 1e-3, bool(code & 1), bool(code & 2), zero == SET)
 
 
-def encode_report(record: PiperFeedback | PoseNumbers | AccelerationLimit | Acknowledgement) -> CanFrame:
+def encode_report(record: PiperFeedback | PoseNumbers | Acknowledgement) -> CanFrame:
     """Return the frame of what the arm reports."""
     match record:
         case PiperStatus():
@@ -121,8 +112,6 @@ def encode_report(record: PiperFeedback | PoseNumbers | AccelerationLimit | Ackn
         case JointLimits(motor, upper, lower, velocity):
             tenths = MILLIDEGREES * 1e-2
             return protocol.LIMITS_ID, pack(">BhhHx", motor, upper * tenths, lower * tenths, velocity * 1e3)
-        case AccelerationLimit(motor, acceleration):
-            return protocol.ACCELERATION_ID, pack(">BH5x", motor, acceleration * 1e3)
         case Acknowledgement(command, zero_set):
             return protocol.ACKNOWLEDGEMENT, bytes((command, int(zero_set), 0, 0, 0, 0, 0, 0))
         case GripperStroke(stroke, percent, friction):
