@@ -176,7 +176,7 @@ def test_the_check_names_the_calibration_and_another_arm() -> None:
         found = {result.name: result for result in check(spec, 0.2)}
         assert list(found) == ["controller", "state", "calibration", "tcp", "payload", "states"]
         assert found["state"].level == found["payload"].level == found["calibration"].level == "ok"
-        twin = Controller("ur10e", spec.home, 0.0, [0.0] * 6)
+        twin = Controller("ur10e", spec.home)
         tcp = find_tcp(spec)
         assert tcp is not None
         before = forward(twin.dh, spec.home, tcp)[:3]

@@ -21,7 +21,7 @@ from hal.config.loader import load
 from hal.drivers.can.settings import BusSettings
 from hal.drivers.scene.shared import address_of
 from hal.specs import RobotSpec
-from hal_emulators.lines import Losses
+from hal_emulators.lines import LONGEST_GAP, Losses
 from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
 
 from .damiao import EmulatedDamiaoArm
@@ -29,8 +29,6 @@ from .piper import EmulatedPiperArm
 
 _STEP = 1e-3
 """Step of the mechanics, s."""
-_LONGEST_GAP = 0.25
-"""Time that the mechanics make up for after the machine had no time for them, s."""
 EmulatedArm = EmulatedDamiaoArm | EmulatedPiperArm
 _ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": EmulatedDamiaoArm, "piper": EmulatedPiperArm}
 
@@ -137,7 +135,7 @@ class EmulatedBus:
                 self._end.wait(pause)
             now = time.monotonic()
             with self.lock:
-                if now - due > _LONGEST_GAP:
+                if now - due > LONGEST_GAP:
                     self.late += int((now - due) / _STEP)
                     due = now
                 while due <= now:

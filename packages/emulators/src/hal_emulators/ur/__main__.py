@@ -22,16 +22,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--robot", choices=sorted(ROBOTS), default="ur5e", help="which arm; ur3, ur5, ur10 are CB3 (%(default)s)")
     add("--q", type=float, nargs=6, default=HOME, metavar="RAD", help="joint positions at the start")
-    add("--payload", type=float, default=0.0, metavar="KG", help="payload of the installation")
-    tcp = "tcp of the installation: m, rotation vector"
-    add("--tcp", type=float, nargs=6, default=(0.0,) * 6, metavar="M", help=tcp)
     add("--calibrated", action="store_true", help="lengths and angles off from the nominal ones, drawn by the seed")
     ports = f"RTDE {RTDE}, dashboard {DASHBOARD}"
     return run_program(parser, arguments, "ur", _create, lambda arm: f"{1.0 / arm.controller.dt:g} Hz, {ports}")
 
 
 def _create(options: argparse.Namespace) -> UrServer:
-    controller = Controller(options.robot, options.q, options.payload, options.tcp)
+    controller = Controller(options.robot, options.q)
     if options.calibrated:
         controller.calibrate(options.seed)
     return UrServer(options.host, controller, options.seed)

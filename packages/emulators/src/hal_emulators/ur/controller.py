@@ -40,7 +40,7 @@ _PROGRAM_STOP, _PROTECTIVE_DECELERATION = 8.0, 30.0
 class Controller(NetworkController):
     """One controller with its arm. ``step`` lets a cycle pass."""
 
-    def __init__(self, robot: str, q: Sequence[float], payload: float, tcp: Sequence[float]) -> None:
+    def __init__(self, robot: str, q: Sequence[float]) -> None:
         self.robot, self.dh = robot, parameters(robot)
         self.rate = ROBOTS[robot][2]
         super().__init__(1.0 / self.rate)
@@ -48,7 +48,7 @@ class Controller(NetworkController):
         self.version = (5, 15, 0, 0) if self.rate == 500 else (3, 15, 0, 0)
         self.remote = True
         self.robot_mode, self.safety_mode = RUNNING, NORMAL
-        self.payload, self.cog, self.tcp = payload, [0.0] * 3, list(tcp)
+        self.payload, self.cog, self.tcp = 0.0, [0.0] * 3, [0.0] * 6
         self.inputs: dict[str, float] = {}
         """Registers that clients write."""
         self.outputs: dict[str, float] = {}

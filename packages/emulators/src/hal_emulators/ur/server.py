@@ -206,8 +206,8 @@ class UrServer(NetworkArm):
 
     def renew(self) -> Controller:
         old = self.controller
-        new = Controller(old.robot, self._home, old.payload, old.tcp)
-        new.cog, new.dh, new.now = old.cog, old.dh, old.now
+        new = Controller(old.robot, self._home)
+        new.payload, new.cog, new.tcp, new.dh, new.now = old.payload, old.cog, old.tcp, old.dh, old.now
         return new
 
     def describe(self) -> dict[str, Any]:
