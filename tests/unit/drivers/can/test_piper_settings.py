@@ -35,8 +35,8 @@ def test_a_rig_without_mistakes_has_no_problems() -> None:
     [
         ({"fd": True}, "real.fd", "not_supported"),
         ({"bit_rate": 500_000}, "real.bit_rate", "out_of_range"),
-        ({"speed_percent": 0}, "real.speed_percent", "invalid"),
-        ({"speed_percent": 101}, "real.speed_percent", "invalid"),
+        ({"speed_percent": 0}, "real.speed_percent", "out_of_range"),
+        ({"speed_percent": 101}, "real.speed_percent", "out_of_range"),
         ({"mounting": "ceiling"}, "real.mounting", "invalid_choice"),
         ({"rate_hz": 500.0}, "rate_hz", "out_of_range"),
         ({"joints": 7}, "model", "wrong_count"),
