@@ -498,7 +498,7 @@ class Control:
             return
         before, pressed, number = self._grip
         small = abs(target[0] - before) <= gripper.spec.width_max * 0.005 and target[1] == pressed
-        if not (number and small) or gripper._was_stopped(number):
+        if not (number and small) or gripper._is_over(number):
             self._grip = (*target, gripper._send(self._id, *target))
 
 

@@ -216,10 +216,16 @@ class Gripper:
             return 0
         return self._put(stops, GripperAct.MOVE, width, self.spec.speed, force, session=session)
 
-    def _was_stopped(self, number: int) -> bool:
-        """Return whether the newest command is the one of this number, and was stopped before its end."""
+    def _is_over(self, number: int) -> bool:
+        """Return whether the command of this number was stopped before its end, or another one came since."""
         state = self.peek()
-        return state is not None and state.target_seq == number and state.outcome is GripperOutcome.STOPPED
+        stopped = state is not None and state.outcome is GripperOutcome.STOPPED and state.target_seq == number
+        return stopped or self._commands != number
+
+    def _forget_grip(self) -> None:
+        """Let a session send its grip again: the fingers were placed elsewhere."""
+        with self._sending:
+            self._commands += 1
 
     def _put(self, stops: int, act: GripperAct, *numbers: float, session: int = 0) -> int:
         with self._sending:

@@ -151,7 +151,8 @@ class Rig:
             self._open_renderer(world_host)
         self._wait_for_hosts(realtime)
         if world_host is not None:
-            self.world = World(world_host.request, partial(self._pass_on_edit, world_host), self.plan.world)
+            request, edited = partial(self._request_world, world_host), partial(self._pass_on_edit, world_host)
+            self.world = World(request, edited, self.plan.world)
         for host in self._hosts:
             self.notes.extend(host.request("warnings"))
             for spec in host.spec.robots:
@@ -414,6 +415,14 @@ class Rig:
         A session that is open stays stopped: it is continued by ``control.rearm()``, or by its dead-man.
         """
         self._latch.rearm()
+
+    def _request_world(self, host: Host, method: str, params: dict[str, Any]) -> Any:
+        answer = host.request(method, params)
+        if method in ("world.reset", "world.restore"):
+            for robot in host.spec.robots:
+                if (gripper := self.robots[robot.name].gripper) is not None:
+                    gripper._forget_grip()
+        return answer
 
     def _pass_on_edit(self, host: Host, method: str, params: dict[str, Any], revision: int) -> None:
         if method == "add":

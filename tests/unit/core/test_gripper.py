@@ -251,6 +251,16 @@ def test_a_grip_or_a_width_is_sent_with_a_command(
     assert gripper.state().width_target == pytest.approx(expected, abs=1e-6)
 
 
+def test_a_grip_counts_again_once_another_command_moved_the_fingers(rig: hal.Rig, gripper: hal.Gripper) -> None:
+    with rig.robots["panda"].control() as control:
+        for opens in (False, True):
+            if opens:
+                gripper.start(gripper.width_max)
+            for _, _ in zip(rig.clock.rate(50), range(60), strict=False):
+                control.send(REST, grip=1.0)
+            assert gripper.state().width == pytest.approx(gripper.width_min, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     "passed",
     [

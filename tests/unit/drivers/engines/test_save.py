@@ -105,22 +105,24 @@ def test_an_open_session_waits_at_the_restored_set_point_for_a_new_command(engin
         arm = rig.robots["panda"]
         with arm.control(rate_hz=20) as control:
 
-            def stream(command: Any, times: int) -> None:
+            def stream(command: Any, times: int, grip: float | None = None) -> None:
                 for _ in range(times):
-                    control.send(command)
+                    control.send(command, grip=grip)
                     rig.clock.sleep(0.05)
 
             stream(hal.Twist(linear=[0.0, 0.1, 0.0]), 4)
             state = rig.world.save()
             held, before = arm.state().q_set, rig.clock.now()
-            stream(hal.Twist(linear=[0.0, 0.0, 0.1]), 10)
+            stream(hal.Twist(linear=[0.0, 0.0, 0.1]), 10, grip=1.0)
             assert np.abs(arm.state().q - held).max() > 0.02
             rig.world.restore(state)
             assert rig.clock.now() > before, "time goes on"
             rig.clock.sleep(0.1)
             assert np.abs(arm.state().q - held).max() < 2e-3, "the old command is gone"
-            stream(hal.Twist(linear=[0.0, 0.0, 0.1]), 10)
+            stream(hal.Twist(linear=[0.0, 0.0, 0.1]), 10, grip=1.0)
             assert np.abs(arm.state().q - held).max() > 0.02, "the session follows a new one"
+            assert arm.gripper is not None
+            assert arm.gripper.state().width < 0.06, "and so do the fingers, which the restored state has open"
 
 
 @pytest.mark.parametrize("torque", [False, True])
