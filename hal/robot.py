@@ -474,13 +474,12 @@ class Robot:
     def recover(self) -> None:
         """Clear a fault of the device; only the user decides on it. :meth:`state` returns a newer state afterwards."""
         self._host.request("recover", {"robot": self.name})
-        if self._host.spec.clock == "real_time":
-            start = self.clock.now()
-            while (now := self.clock.now()) < start + _FRESH_STATE:
-                state = self._mail.get_state()
-                if state is not None and state.stamp.t >= start:
-                    return
-                self.clock.sleep(min(0.001, start + _FRESH_STATE - now))
+        start = self.clock.now()
+        while (now := self.clock.now()) < start + _FRESH_STATE:
+            state = self._mail.get_state()
+            if state is not None and state.stamp.t > start:
+                return
+            self.clock.sleep(min(0.001, start + _FRESH_STATE - now))
 
     def inject(self, **faults: object) -> None:
         """Switch faults of a simulated driver on or off, for tests; see the driver's own ``inject``."""

@@ -224,6 +224,18 @@ def test_what_was_not_written_to_a_lost_arm_is_no_peak(rig: hal.Rig, arm: hal.Ro
     assert all(0.0 < share <= 1.0 for share in peak.values()), peak
 
 
+def test_a_recovered_arm_continues_at_once(rig: hal.Rig, arm: hal.Robot) -> None:
+    with arm.control() as control:
+        arm.inject(fault="too hot")
+        rig.clock.sleep(0.3)
+        with pytest.raises(RobotFault):
+            control.send(TURN)
+        arm.recover()
+        control.rearm()
+        drive(rig, control)
+        assert arm.state().status is RobotStatus.FOLLOWING
+
+
 def test_an_arm_whose_driver_passes_no_set_point_on_is_a_fault(rig: hal.Rig, arm: hal.Robot) -> None:
     driver = rig.driver("panda")
     write = driver.write
