@@ -172,6 +172,9 @@ class Control:
         session = Session(self._id, *terms, self._goal, self._law, self._path)
         try:
             robot._open = self
+            if session.is_motion:
+                points = [q for section in self._path or () for q in section.q] or [self._goal or ()]
+                self._mail.put_way(self._id, points)
             self._publish(SessionRecord(self._id, stops, 0))
             if self.deadman is not None:
                 self._detach = self.deadman.attach(self._mail.put_deadman)

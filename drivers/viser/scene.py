@@ -168,18 +168,15 @@ def workspace_lines(workspace: WorkspaceSpec) -> NDArray[np.float32]:
     """
     low = np.clip(workspace.lower, -_OPEN_SIDE, _OPEN_SIDE)
     high = np.clip(workspace.upper, -_OPEN_SIDE, _OPEN_SIDE)
-    segments: list[list[NDArray[np.float64]]] = []
+    segments = []
     for axis in range(3):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
         for bound, drawn in ((workspace.lower[axis], low), (workspace.upper[axis], high)):
-            if drawn[axis] != bound:
-                continue
-            a, b = (axis + 1) % 3, (axis + 2) % 3
-            corners = []
-            for first, second in ((low, low), (high, low), (high, high), (low, high)):
-                corner = np.empty(3)
-                corner[[axis, a, b]] = bound, first[a], second[b]
-                corners.append(corner)
-            segments += [[corners[k], corners[(k + 1) % 4]] for k in range(4)]
+            if drawn[axis] == bound:
+                ring = np.full((5, 3), bound)
+                ring[:, a] = low[a], high[a], high[a], low[a], low[a]
+                ring[:, b] = low[b], low[b], high[b], high[b], low[b]
+                segments.append(np.stack((ring[:-1], ring[1:]), axis=1))
     return np.asarray(segments, np.float32).reshape(-1, 2, 3)
 
 

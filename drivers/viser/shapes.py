@@ -30,7 +30,8 @@ _NEARER = 0.7
 """The same as a share of what they have beyond the margin at home, if it is less: an arm at home has no colours."""
 _AT_MARGIN = 0.002
 """Distance beyond the margin below which they are red, m: the servo lets them come no nearer."""
-_AMBER, _RED, _GHOST = (240, 160, 30), (220, 40, 40), (110, 150, 220)
+_AMBER, _RED, _GHOST, _WAY = (240, 160, 30), (220, 40, 40), (110, 150, 220), (50, 90, 200)
+_WAY_LINES = 40
 _AWAY = 0.02
 """Way of any joint to the goal from which on the ghost is shown, rad or m."""
 
@@ -38,8 +39,9 @@ _AWAY = 0.02
 class ShapesView:
     """The shapes that the collision check compares, amber near each other and red at the margin; and a ghost.
 
-    The ghost is at the goal of the dragged handle, else at that of the newest command: joint positions, a pose of the
-    tcp, or the last point of a chunk. A velocity has no goal.
+    The ghost is at the goal of the dragged handle, else at the end of the arm's motion, or at the goal of the newest
+    command: joint positions, a pose of the tcp, or the last point of a chunk. A velocity has no goal. A line shows the
+    way of the tcp in a motion or a chunk.
     """
 
     def __init__(self, scene: SceneApi, spec: RobotSpec, others: Sequence[RobotSpec], check: CollisionSpec) -> None:
@@ -65,6 +67,8 @@ class ShapesView:
         self._ghost = CollisionModel([spec], CollisionSpec())
         self._ghost.place(spec.kinematics.home)
         self._ghost_nodes = _draw(scene, f"/ghost/{spec.name}", self._ghost, 0.3)
+        line = np.zeros((_WAY_LINES, 2, 3), np.float32)
+        self._way = scene.add_line_segments(f"/arms/{spec.name}/way", line, _WAY, thickness=0.004, visible=False)
         self._goal: tuple[Kind, tuple[float, ...]] | None = None
         self._goal_q: Array | None = None
 
@@ -81,13 +85,23 @@ class ShapesView:
 
     def show_ghost(self, mail: RobotMail, state: RobotState, dragged: Pose | None) -> None:
         """Show the goal of the dragged handle, in the base frame, or of the newest command, if the arm is elsewhere."""
-        goal = _find_goal(mail, dragged)
+        goal = find_goal(mail, dragged)
         if goal != self._goal:
             self._goal, self._goal_q = goal, None if goal is None else self._solve(*goal, state)
             if self._goal_q is not None:
                 self._ghost.place(self._goal_q)
+            if goal is not None and goal[0] is Kind.JOINT_CHUNK:
+                self._way.points = self._find_way(np.vstack((state.q, np.reshape(goal[1], (-1, len(state.q))))))
+            self._way.visible = goal is not None and goal[0] is Kind.JOINT_CHUNK
         away = self._goal_q is not None and bool(np.abs(self._goal_q - state.q).max() > _AWAY)
         _show(self._ghost_nodes, self._ghost, dict.fromkeys(range(len(self._ghost_nodes)), _GHOST) if away else {})
+
+    def _find_way(self, points: Array) -> NDArray[np.float32]:
+        """Return the lines (k, 2, 3) of the tcp along joint positions (k, n)."""
+        share = np.linspace(0.0, len(points) - 1, _WAY_LINES + 1)
+        joints = np.transpose([np.interp(share, range(len(points)), part) for part in points.T])
+        tcp = np.array([self._kinematics.fk(q)[:3] for q in joints], np.float32)
+        return np.stack((tcp[:-1], tcp[1:]), axis=1)
 
     def _solve(self, kind: Kind, values: tuple[float, ...], state: RobotState) -> Array | None:
         """Return the joint positions (n,) of a goal; None if it is out of reach."""
@@ -99,14 +113,18 @@ class ShapesView:
             return None
 
 
-def _find_goal(mail: RobotMail, dragged: Pose | None) -> tuple[Kind, tuple[float, ...]] | None:
+def find_goal(mail: RobotMail, dragged: Pose | None) -> tuple[Kind, tuple[float, ...]] | None:
+    """Return what the arm goes to, with the kind of its values; those of a motion or a chunk are its points alone."""
     if dragged is not None:
         return Kind.CARTESIAN_TARGET, (*dragged.position.tolist(), *dragged.orientation.tolist())
-    command = mail.get_command()
-    if command is None or command.session != mail.get_session().session or command.deadline < time.monotonic():
+    session, command = mail.get_session().session, mail.get_command()
+    if way := mail.read_way(session):
+        return Kind.JOINT_CHUNK, way
+    if command is None or command.session != session or command.deadline < time.monotonic() or not command.values:
         return None
-    goals = (Kind.JOINT_TARGET, Kind.CARTESIAN_TARGET, Kind.JOINT_CHUNK)
-    return (command.kind, command.values) if command.kind in goals and command.values else None
+    if command.kind is Kind.JOINT_CHUNK:
+        return command.kind, command.values[len(command.values) // (mail.n + 1) :]
+    return (command.kind, command.values) if command.kind in (Kind.JOINT_TARGET, Kind.CARTESIAN_TARGET) else None
 
 
 def _draw(scene: SceneApi, root: str, model: CollisionModel, opacity: float) -> list[MeshHandle]:

@@ -328,6 +328,8 @@ def _gripper_state(record: bytes) -> GripperState:
 _APP = "dQ"
 _HOST = "dQQ?"
 _DEADMAN = "??Qd"
+_WAY = 1 << 62
+"""Added to the number of a session, for the way of its motion: no number of a command is so large."""
 STATES = 1024
 """Number of states of an arm that stay readable: 4 s at 240 Hz, 1 s at 1 kHz."""
 
@@ -419,6 +421,16 @@ class RobotMail:
         """Return the newest chunk as (number of its command, values); None before the first one."""
         chunk = self._chunk.read()
         return None if chunk is None else chunk[2:]
+
+    def put_way(self, session: int, points: Sequence[Sequence[float]]) -> None:
+        """Publish joint positions (k, n) on the way of a session's one motion, for views: it has no other chunks."""
+        every = -(-len(points) // CHUNK_POINTS)
+        self.put_chunk(_WAY + session, [x for point in points[(len(points) - 1) % every :: every] for x in point])
+
+    def read_way(self, session: int) -> tuple[float, ...]:
+        """Return the positions on the way of the motion of this session; empty if it makes none."""
+        chunk = self.read_chunk()
+        return tuple(chunk[1]) if chunk is not None and chunk[0] == _WAY + session else ()
 
     def put_deadman(self, record: DeadmanRecord) -> None:
         """Publish the state of the dead-man."""

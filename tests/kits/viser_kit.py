@@ -8,6 +8,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
+import numpy as np
 import viser
 import zstandard
 from websockets.sync.client import connect, unix_connect
@@ -35,7 +36,7 @@ class PlainPage:
         else:
             self.socket = unix_connect(address, "ws://viser/", **options)
         self.nodes: dict[str, dict[str, Any]] = {}
-        """Newest ``position``, ``wxyz``, ``visible`` and ``color`` of each node, by name."""
+        """Newest ``position``, ``wxyz``, ``visible``, and properties that changed, of each node, by name."""
         self.buttons: dict[str, str] = {}
         self.say(
             "ViewerCameraMessage",
@@ -76,10 +77,16 @@ class PlainPage:
             assert isinstance(frame, bytes)
             size = int.from_bytes(frame[8:16], "little")
             inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])
-            for message in msgspec.msgpack.decode(inner)["messages"]:
-                self._take(message)
+            decoded = msgspec.msgpack.decode(inner)
+            arrays, place = list[bytes](), 16 + size
+            for length in decoded["binaryBufferLengths"]:
+                place += -place % 8
+                arrays.append(frame[place : place + length])
+                place += length
+            for message in decoded["messages"]:
+                self._take(message, arrays)
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _take(self, message: dict[str, Any], arrays: list[bytes]) -> None:
         kind, name = message["type"], message.get("name", "")
         if kind == "SetPositionMessage":
             self.nodes.setdefault(name, {})["position"] = message["position"]
@@ -88,7 +95,10 @@ class PlainPage:
         elif kind == "SetSceneNodeVisibilityMessage":
             self.nodes.setdefault(name, {})["visible"] = message["visible"]
         elif kind == "SceneNodeUpdateMessage":
-            self.nodes.setdefault(name, {}).update(message["updates"])
+            for key, value in message["updates"].items():
+                if isinstance(value, dict):
+                    value = np.frombuffer(arrays[value["__binary_index"]], value["dtype"])
+                self.nodes.setdefault(name, {})[key] = value
         elif kind == "GuiButtonMessage":
             self.buttons[message["props"]["label"]] = message["uuid"]
 

@@ -146,11 +146,21 @@ def status(address: str, **headers: str) -> int:
         connection.close()
 
 
+def way(page: PlainPage) -> np.ndarray | None:
+    """Return the points (k, 3) of the line along the way of the tcp as it is shown; None if it is hidden."""
+    node = page.nodes.get("/arms/panda/way", {})
+    return node["points"].reshape(-1, 3) if node.get("visible") else None
+
+
 def test_links_fingers_and_handle_follow_the_arm(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
     arm = rig.robots["panda"]
     q = np.array(arm.home)
     q[[0, 3]] += (0.2, -0.15)
-    arm.move_to(q, speed=0.3)
+    motion = arm.start_move_to(q, speed=0.3)
+    until(lambda: page.hear() or way(page) is not None)
+    assert way(page)[-1] == pytest.approx(arm.fk(q).position, abs=2e-3), "the line ends where the arm is going"
+    motion.wait()
+    until(lambda: page.hear() or way(page) is None)
     arm.gripper.move(0.02)
     tree = read_urdf(Path(arm.spec.urdf))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ import pytest
 import trimesh
 from specs import data, panda
 
+from hal.commands import CHUNK_POINTS, Command, CommandRecord, JointChunk, Kind, SessionRecord, encode
 from hal.config.data_files import find_data
 from hal.drivers.scene.shapes import Visual
 from hal.drivers.viser.meshes import visuals_glb
+from hal.host.records import RobotMail
 from hal.kinematics.urdf import read_urdf
 from hal.specs import WorkspaceSpec
 
@@ -114,3 +117,28 @@ def test_workspace_is_drawn_at_its_bounded_sides() -> None:
     assert table.shape == (4, 2, 3)
     assert (table[..., 2] == np.float32(0.01)).all()
     assert len(workspace_lines(WorkspaceSpec((-10.0,) * 3, (10.0,) * 3))) == 0
+
+
+def test_what_an_arm_goes_to_is_the_way_of_its_motion_or_the_points_of_its_newest_command() -> None:
+    pytest.importorskip("viser", reason="needs viser (pip install 'robot-hal[viewer]')")
+    from hal.drivers.viser.shapes import find_goal
+
+    mail = RobotMail(memoryview(bytearray(RobotMail.size(2))), 2)
+
+    def send(session: int, command: Command) -> None:
+        now = time.monotonic()
+        kind, values = encode(command, now)
+        mail.put_command(CommandRecord(1, session, now, now + 60.0, kind, values))
+
+    mail.put_session(SessionRecord(1, 0, 0))
+    assert find_goal(mail, None) is None
+    send(1, JointChunk(time.monotonic() + np.array([0.1, 0.2, 0.3]), [[1, 2], [3, 4], [5, 6]]))
+    assert find_goal(mail, None) == (Kind.JOINT_CHUNK, (1, 2, 3, 4, 5, 6))
+    mail.put_session(SessionRecord(2, 0, 0))
+    assert find_goal(mail, None) is None, "that session is over"
+    mail.put_way(2, [(k, -k) for k in range(1000)])
+    kind, values = find_goal(mail, None) or (None, ())
+    assert (kind, values[-2:]) == (Kind.JOINT_CHUNK, (999, -999)), "a long way has fewer points, and its last one"
+    assert 400 < len(values) <= 2 * CHUNK_POINTS
+    mail.put_session(SessionRecord(0, 0, 0))
+    assert find_goal(mail, None) is None
