@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from hal.rig import Rig
 
 _TOKEN_BYTES = 18
-_STREAMS = (*(name for name, kind in STREAMS.items() if not kind.exact), "depth")
-"""A page shows the first of these streams that a camera has."""
+_STREAMS = sorted(STREAMS, key=lambda name: STREAMS[name].exact)
+"""A page shows the first of these streams that a camera has, and the others on request."""
 _MAX_LINE = 300
 """Characters of a line; a page shows no more."""
 _CHECK_PERIOD = 0.5
@@ -81,14 +81,14 @@ class WebConsole(Console):
         self._recovering = threading.Lock()
         groups = rig.shared_states()
         self._shown = [
-            replace(camera, streams=(stream,))
+            replace(camera, name=name, streams=(stream,))
             for camera in rig.plan.cameras
-            if (stream := next((one for one in _STREAMS if one in camera.streams), None)) is not None
+            for stream, name in _name_streams(camera).items()
         ]
         self._frames = SharedMemory(frame_rings_size(self._shown))
         self._rings = frame_rings(self._frames.buffer, self._shown)
         config = {
-            "rig": _rig_message(rig, self._shown, driven_by),
+            "rig": _rig_message(rig, driven_by),
             "viewer": rig.viewer3d.address if rig.viewer3d is not None else "",
             "listen": [listen.address, listen.port],
             "port_fixed": listen.fixed,
@@ -164,18 +164,15 @@ class WebConsole(Console):
         self._channel.send_newest("recording", "recording", t=time.monotonic(), view=recording_message(view))
 
     def show_camera(self, camera: Camera) -> None:
-        spec = next((spec for spec in self._shown if spec.name == camera.name), None)
-        if spec is not None:
-            self._detach.append(camera.on_frame(lambda frame: self._show_frame(spec, frame)))
+        names = _name_streams(camera.spec)
+        self._detach.append(camera.on_frame(lambda frame: self._show_frame(names, frame)))
 
-    def _show_frame(self, spec: CameraSpec, frame: Frame) -> None:
-        if spec.name not in self._watched:
-            return
-        stamp = frame.stamp
-        layers = {name: getattr(frame, name) for name in spec.streams}
-        raw = RawFrame(stamp.t, stamp.t_device, stamp.seq, **layers)
-        self._rings[spec.name].write(raw)
-        self._channel.send_newest(f"frame {spec.name}", "frame", camera=spec.name)
+    def _show_frame(self, names: Mapping[str, str], frame: Frame) -> None:
+        for stream, name in names.items():
+            if name in self._watched:
+                layer = {stream: getattr(frame, stream)}
+                self._rings[name].write(RawFrame(frame.stamp.t, frame.stamp.t_device, frame.stamp.seq, **layer))
+                self._channel.send_newest(f"frame {name}", "frame", camera=name)
 
     # What pages request.
 
@@ -382,7 +379,13 @@ class ProcessChannel:
 # What the process and its pages get as JSON.
 
 
-def _rig_message(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None) -> dict[str, Any]:
+def _name_streams(camera: CameraSpec) -> dict[str, str]:
+    """Return the name of each stream's pictures: that of the camera for the first one."""
+    streams = [name for name in _STREAMS if name in camera.streams]
+    return {stream: f"{camera.name}/{stream}" if k else camera.name for k, stream in enumerate(streams)}
+
+
+def _rig_message(rig: Rig, driven_by: str | None) -> dict[str, Any]:
     """Return everything that does not change while the rig is open."""
     return {
         "source": rig.plan.source,
@@ -401,9 +404,10 @@ def _rig_message(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None)
                 "width": camera.width,
                 "height": camera.height,
                 "rate_hz": camera.rate_hz,
-                "shows": camera.streams[0],
+                "streams": _name_streams(camera),
+                "depth": [camera.depth_min, camera.depth_max],
             }
-            for camera in cameras
+            for camera in rig.plan.cameras
         ],
     }
 

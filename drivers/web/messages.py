@@ -93,7 +93,8 @@ class DriverRequest(NamedTuple):
 class WatchRequest(NamedTuple):
     """Send the pictures of these cameras from now on, and of no others."""
 
-    cameras: tuple[str, ...]
+    widths: dict[str, float]
+    """Width at which the page shows each camera, device pixels."""
 
 
 class PictureDrawn(NamedTuple):
@@ -181,9 +182,9 @@ def _request(what: str, key: str, value: object) -> DriverRequest:
 
 
 def _watch(known: _Names, cameras: object) -> WatchRequest:
-    if not isinstance(cameras, list):
-        raise MalformedMessage("not a list of cameras")
-    return WatchRequest(tuple(dict.fromkeys(_check_choice(name, known.cameras) for name in cameras)))
+    if not isinstance(cameras, dict):
+        raise MalformedMessage("no widths of cameras")
+    return WatchRequest({_check_choice(name, known.cameras): _number(w, 1.0, _MAX_TIME) for name, w in cameras.items()})
 
 
 _MESSAGES: dict[str, tuple[set[str], Callable[..., PageMessage]]] = {

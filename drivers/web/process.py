@@ -34,7 +34,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
 
     Raises:
         NotSupported: The address or the port cannot be listened at.
-        DriverMissing: A library, or a file of the page, is not installed.
+        DriverMissing: A library is not installed.
     """
     try:
         from aiohttp.http import HttpProcessingError

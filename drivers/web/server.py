@@ -22,7 +22,7 @@ from typing import Any
 from aiohttp import web
 
 from hal.auth import Authenticator
-from hal.errors import ConnectionLost, DriverMissing, NotSupported
+from hal.errors import ConnectionLost, NotSupported
 from hal.host.process import Channel, SharedMemory
 from hal.host.ring import frame_rings
 from hal.keys import Credentials
@@ -32,7 +32,7 @@ from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
 from hal.views import ACTIONS
 
 from .messages import MalformedMessage, StopRequest, encode, parse
-from .pictures import PictureCache, PictureSockets
+from .pictures import DEPTH_COLORS, UNKNOWN_COLOR, PictureCache, PictureSockets
 from .session import WebPage, WebSession, make_app_queue
 from .sockets import CONNECTIONS, ConnectionLimit, PageSocket, PageSockets
 from .stage import STAGE_POLICY, Stage
@@ -154,7 +154,6 @@ class AppChannel:
         self._channel = channel
         self._receive = receive
         self._unsent = b""
-        self._writing = False
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def start(self) -> None:
@@ -186,33 +185,22 @@ class AppChannel:
         try:
             while self._fill():
                 self._unsent = self._unsent[self._channel.sock.send(self._unsent) :]
-            self._write_later(False)
+            self._loop.remove_writer(self._channel.sock)
         except BlockingIOError:
-            self._write_later(True)
+            self._loop.add_writer(self._channel.sock, self.flush)
         except OSError:
             self._end()
 
     def _fill(self) -> bool:
         """Return whether there is something to send."""
-        if not self._unsent:
-            message = self.queue.pop()
-            if message is not None:
-                self._unsent = encode(message).encode() + b"\n"
+        if not self._unsent and (message := self.queue.pop()) is not None:
+            self._unsent = encode(message).encode() + b"\n"
         return bool(self._unsent)
-
-    def _write_later(self, later: bool) -> None:
-        assert self._loop is not None
-        if later != self._writing:
-            self._writing = later
-            if later:
-                self._loop.add_writer(self._channel.sock, self.flush)
-            else:
-                self._loop.remove_writer(self._channel.sock)
 
     def _end(self) -> None:
         if self._loop is not None:
             self._loop.remove_reader(self._channel.sock)
-            self._write_later(False)
+            self._loop.remove_writer(self._channel.sock)
         self.ended.set()
 
 
@@ -248,15 +236,7 @@ class LiveSockets(PageSockets):
 
 
 def read_page_files(folder: Path = _PAGE) -> dict[str, PageFile]:
-    """Return the files of the page by name; no other file is ever served.
-
-    Raises:
-        DriverMissing: The folder has no page (``code`` is ``page_missing``).
-    """
-    if not (folder / _INDEX).is_file():
-        raise DriverMissing(
-            f"the console's page is missing: no {folder / _INDEX}; install the project again", code="page_missing"
-        )
+    """Return the files of the page by name; no other file is ever served."""
     return {
         path.name: (path.read_bytes(), _TYPES[path.suffix])
         for path in sorted(folder.iterdir())
@@ -265,7 +245,7 @@ def read_page_files(folder: Path = _PAGE) -> dict[str, PageFile]:
 
 
 def keys_module(table: Mapping[str, Any]) -> PageFile:
-    """Return ``keys.js``, the module of the page with constants of this project: keys, axes, buttons, a time limit.
+    """Return ``keys.js``, the module of the page with constants of this project: keys, axes, buttons, limits, colours.
 
     Args:
         table: The keys, a ``hal.pads.keyboard.KeyboardTable``.
@@ -277,6 +257,8 @@ def keys_module(table: Mapping[str, Any]) -> PageFile:
         "BUTTONS": BUTTONS,
         "ACTIONS": ACTIONS,
         "PAD_SILENCE": PAD_SILENCE,
+        "DEPTH_COLORS": DEPTH_COLORS,
+        "UNKNOWN_COLOR": UNKNOWN_COLOR,
     }
     text = "".join(f"export const {name} = {json.dumps(value)};\n" for name, value in constants.items())
     return text.encode(), _TYPES[".js"]
@@ -342,30 +324,20 @@ def open_listener(address: str, port: int, *, fixed: bool) -> socket.socket:
     last = port if fixed or port == 0 else min(port + _MORE_PORTS, 65535)
     for number in range(port, last + 1):
         try:
-            return _listen(address, number)
+            family = socket.getaddrinfo(address, number, type=socket.SOCK_STREAM)[0][0]
+            dual = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+            sock = socket.create_server((address, number), family=family, backlog=_BACKLOG, dualstack_ipv6=dual)
+            sock.setblocking(False)
+            return sock
         except OSError as error:
             taken = error.errno == errno.EADDRINUSE
             if taken and number < last:
                 continue
             which = f"port {number}" if number == port else f"any of the ports {port} to {number}"
-            reason = error.strerror or str(error)
+            reason = (error.strerror or str(error)).partition(" (while")[0]
             foreign = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
             if foreign:
                 reason += f"; is {address} an address of this machine?"
             code = "port_taken" if taken else "bad_address" if foreign else "cannot_listen"
             raise NotSupported(f"the console cannot listen on {which} of {address}: {reason}", code=code) from None
     raise AssertionError("unreachable: the last port returns or raises")
-
-
-def _listen(address: str, port: int) -> socket.socket:
-    family, kind, protocol, _, place = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
-    sock = socket.socket(family, kind, protocol)
-    try:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(place)
-        sock.listen(_BACKLOG)
-        sock.setblocking(False)
-    except OSError:
-        sock.close()
-        raise
-    return sock

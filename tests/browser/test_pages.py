@@ -75,6 +75,11 @@ def test_the_cameras_show_what_happens() -> None:
         wait_for(lambda: browser.run(picture)[0] != still, "another picture")
         let_go_of_all(browser)
         wait_for(lambda: int(browser.text(".camera .numbers").split("/s")[0] or 0) > 5, "a rate")
+        browser.click(".camera.large .segments button:nth-child(2)")
+        wait_for(lambda: "scene (depth)" in browser.text(".camera.large figcaption"), "the other stream")
+        wait_for(lambda: browser.run("return document.querySelector('.camera.large').dataset.state") == "live", "depth")
+        assert "unknown" in browser.text(".camera.large .scale"), "its colours are explained"
+        wait_for(lambda: browser.run(picture)[1] > 20, "colours of depth")
         assert browser.complaints() == []
     finally:
         browser.close()

@@ -21,7 +21,7 @@ from hal.host.ring import frame_rings, frame_rings_size
 from hal.pads.keyboard import keyboard_table
 from hal.specs import CameraSpec, to_json
 from hal.testing import camera_spec
-from hal.types import Limited, RobotStatus, Trip
+from hal.types import STREAMS, Limited, RobotStatus, Trip
 
 TOKEN = "a-token-of-the-test_0123456789"
 JOINTS = [("arm", 3)]
@@ -41,10 +41,9 @@ def camera(name: str, width: int = 64, height: int = 48, stream: str = "color", 
 def frame(spec: CameraSpec, value: float, t: float | None = None) -> RawFrame:
     """A picture of one colour, or depth."""
     flat = (spec.height, spec.width)
-    images: dict[str, Any] = dict.fromkeys(("color", "depth", "infrared", "segmentation"))
+    images: dict[str, Any] = {}
     (stream,) = spec.streams
-    shape, kind = ((*flat, 3), np.uint8) if stream == "color" else (flat, np.float32 if stream == "depth" else np.uint8)
-    images[stream] = np.full(shape, value, kind)
+    images[stream] = np.full((*flat, *STREAMS[stream].shape), value, STREAMS[stream].dtype)
     now = time.monotonic() if t is None else t
     return RawFrame(now, now, 0, **images)
 

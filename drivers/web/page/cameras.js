@@ -2,30 +2,22 @@
 
 import { socketTo, tokenOfPage } from "./connection.js";
 import { byId, choose, make, segments, setData, setText, show } from "./dom.js";
+import { DEPTH_COLORS, UNKNOWN_COLOR } from "./keys.js";
 
 const HEADER = 20; // bytes before the JPEG
 const RETRY = 1000; // ms until the next try
+const DEFAULT = 640; // pixels across, of a picture that is not full
 const SMOOTH = /** @type {const} */ ("high");
 const JPEG = "image/jpeg";
 
-/**
- * @typedef {object} Picture
- * @property {number} camera place in the rig's list
- * @property {ImageBitmap} bitmap
- * @property {number} taken when it was captured, ms on performance.now()
- */
-
 /** The socket with the pictures. */
 class Pictures {
-  constructor() {
-    /** Called to draw a picture; its bitmap is closed afterwards. @type {(picture: Picture) => void} */
-    this.came = () => {};
-    /** Returns the device pixels, across and up, at which a camera is shown; null: unknown. @type {(camera: number) => number[] | null} */
-    this.sizeOf = () => null;
+  /** @param {(name: string) => View | undefined} viewOf returns where pictures of this name are shown */
+  constructor(viewOf) {
+    this.viewOf = viewOf;
     /** @type {string[]} */
     this.cameras = [];
-    /** @type {string[]} */
-    this.watched = [];
+    this.watched = "{}";
   }
 
   /** @type {WebSocket | null} */ #socket = null;
@@ -56,16 +48,16 @@ class Pictures {
     socket.close();
   }
 
-  /** Request the pictures of these cameras only. @param {string[]} names */
-  watch(names) {
-    this.watched = names;
+  /** Request the pictures of these cameras only. @param {Record<string, number>} widths of each, device pixels */
+  watch(widths) {
+    const text = JSON.stringify(widths);
+    if (text === this.watched) return;
+    this.watched = text;
     this.#request();
   }
 
   #request() {
-    if (this.#socket?.readyState === WebSocket.OPEN) {
-      this.#socket.send(JSON.stringify({ type: "watch", cameras: this.watched }));
-    }
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(`{"type":"watch","cameras":${this.watched}}`);
   }
 
   /** @param {WebSocket} socket @param {ArrayBuffer} data */
@@ -73,20 +65,18 @@ class Pictures {
     if (!(data instanceof ArrayBuffer) || data.byteLength <= HEADER) return;
     const arrived = performance.now();
     const view = new DataView(data);
-    const camera = view.getUint8(0);
+    const camera = this.cameras[view.getUint8(0)];
     const taken = arrived - 1000 * view.getFloat32(16, true);
     try {
-      const size = this.sizeOf(camera);
+      const size = this.viewOf(camera)?.size;
       const resize = size && { resizeWidth: size[0], resizeHeight: size[1], resizeQuality: SMOOTH };
       const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, HEADER)], { type: JPEG }), resize ?? {});
-      if (socket === this.#socket) this.came({ camera, bitmap, taken });
+      if (socket === this.#socket) this.viewOf(camera)?.draw(bitmap, taken);
       bitmap.close();
     } catch {
       // A broken picture is not shown; the next one may be complete.
     }
-    if (socket.readyState === WebSocket.OPEN && camera < this.cameras.length) {
-      socket.send(JSON.stringify({ type: "drawn", camera: this.cameras[camera] }));
-    }
+    if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ type: "drawn", camera }));
   }
 }
 
@@ -96,8 +86,9 @@ const WINDOW = 2000; // ms over which the rate is counted
 
 /** One camera on the page. */
 class View {
-  /** @param {any} camera of the rig's list @param {(name: string) => void} choose */
-  constructor(camera, choose) {
+  /** @param {any} camera of the rig's list @param {(name: string) => void} enlarge @param {() => void} changed */
+  constructor(camera, enlarge, changed) {
+    this.camera = camera;
     this.name = camera.name;
     this.patience = Math.max(SILENT, (PERIODS * 1000) / (camera.rate_hz || 30));
     this.figure = make("figure", "camera");
@@ -107,16 +98,36 @@ class View {
     this.canvas.height = camera.height;
     this.shape = camera.width / camera.height;
     this.canvas.setAttribute("role", "img");
-    this.canvas.setAttribute("aria-label", `Camera ${camera.name}`);
     this.context = this.canvas.getContext("2d", { alpha: false });
     this.numbers = make("span", "numbers");
     this.old = make("div", "old");
+    this.title = make("b");
+    this.scale = depthScale(camera.depth);
+    this.streams = make("div", "segments");
+    this.streams.setAttribute("role", "group");
+    this.streams.setAttribute("aria-label", `Picture of camera ${camera.name}`);
+    this.streams.addEventListener("click", (/** @type {Event} */ event) => event.stopPropagation());
+    const names = Object.keys(camera.streams);
+    segments(this.streams, names, (stream) => (this.show(stream), changed()));
     const caption = make("figcaption");
-    const kind = camera.shows === "color" ? "" : ` (${camera.shows})`;
-    caption.append(make("b", "", camera.name + kind), this.numbers);
-    this.figure.append(this.canvas, this.old, caption);
-    this.figure.addEventListener("click", () => choose(camera.name));
-    this.visible = false;
+    caption.append(this.title, this.scale, this.numbers);
+    this.figure.append(this.canvas, this.old, caption, this.streams);
+    this.figure.addEventListener("click", () => enlarge(camera.name));
+    this.visible = this.full = false;
+    /** Name of the pictures that are shown: those of one stream. */
+    this.source = "";
+    this.show(names[0]);
+  }
+
+  /** @param {string} stream */
+  show(stream) {
+    this.source = this.camera.streams[stream];
+    this.#taken = -Infinity;
+    choose(this.streams, stream);
+    setText(this.title, this.name + (stream === "color" ? "" : ` (${stream})`));
+    show(this.scale, stream === "depth");
+    const range = stream === "depth" ? `, ${this.scale.title}` : "";
+    this.canvas.setAttribute("aria-label", `Camera ${this.name}, ${stream}${range}`);
     this.mark(performance.now());
   }
 
@@ -132,8 +143,14 @@ class View {
     return across < 1 ? null : [across, across / this.shape].map((one) => Math.max(1, Math.round(one)));
   }
 
-  /** @param {Picture} picture */
-  draw({ bitmap, taken }) {
+  /** Pixels across to ask for: the camera's, divided by a whole number, so that few sizes are made. */
+  get wanted() {
+    const across = Math.min(this.size?.[0] ?? DEFAULT, this.full ? Infinity : DEFAULT);
+    return Math.floor(this.camera.width / Math.max(1, Math.floor(this.camera.width / across)));
+  }
+
+  /** @param {ImageBitmap} bitmap @param {number} taken when it was captured, ms on performance.now() */
+  draw(bitmap, taken) {
     if (this.canvas.width !== bitmap.width || this.canvas.height !== bitmap.height) {
       this.canvas.width = bitmap.width;
       this.canvas.height = bitmap.height;
@@ -161,6 +178,18 @@ class View {
       setText(this.old, state === "none" ? "no picture yet" : `not live: ${seconds} s old`);
     }
   }
+}
+
+/** Return the colours of depth with what they mean. @param {number[]} range m */
+function depthScale([near, far]) {
+  const scale = make("span", "scale");
+  const colors = [make("i"), make("i")];
+  const listed = DEPTH_COLORS.map((/** @type {number[]} */ color) => `rgb(${color})`);
+  colors[0].style.background = `linear-gradient(to right, ${listed})`;
+  colors[1].style.background = `rgb(${UNKNOWN_COLOR})`;
+  scale.append(`${near}`, colors[0], `${far} m `, colors[1], "unknown");
+  scale.title = `${near} to ${far} m in a logarithmic scale, grey is unknown`;
+  return scale;
 }
 
 /** Return what draws in 3D in this browser; "" if nothing does. */
@@ -215,9 +244,7 @@ class Stage {
 /** The panel of the 3D view and of all cameras. */
 export class Cameras {
   constructor() {
-    this.pictures = new Pictures();
-    this.pictures.sizeOf = (camera) => this.views[camera]?.size ?? null;
-    this.pictures.came = (picture) => this.views[picture.camera]?.draw(picture);
+    this.pictures = new Pictures((name) => this.views.find((view) => view.source === name));
     /** @type {View[]} */
     this.views = [];
     /** The views, with the 3D view before them if there is one. @type {(View | Stage)[]} */
@@ -225,6 +252,7 @@ export class Cameras {
     /** @type {Stage | null} */
     this.stage = null;
     this.large = "";
+    this.alone = false;
     this.seen = new IntersectionObserver((entries) => this.#moved(entries));
     document.addEventListener("visibilitychange", () => this.#watch());
     new ResizeObserver(() => this.#place()).observe(byId("cameras"));
@@ -232,12 +260,11 @@ export class Cameras {
 
   /** Lay out the panel and connect. @param {any[]} cameras of hello @param {string} stage path of the 3D view, or "" */
   open(cameras, stage) {
-    const names = cameras.map((camera) => camera.name);
-    const all = [stage !== "", ...names].join("\n");
+    const all = JSON.stringify([stage !== "", cameras]);
     if (this.#built !== all) this.#build(cameras, stage !== "" && renderer3D() !== "");
     this.#built = all;
     this.stage?.move(stage);
-    this.pictures.open(names);
+    this.pictures.open(cameras.flatMap((camera) => Object.values(camera.streams)));
   }
 
   #built = "?";
@@ -256,7 +283,7 @@ export class Cameras {
   #build(cameras, staged) {
     this.seen.disconnect();
     const enlarge = (/** @type {string} */ name) => this.#enlarge(name, true);
-    this.views = cameras.map((camera) => new View(camera, enlarge));
+    this.views = cameras.map((camera) => new View(camera, enlarge, () => this.#watch()));
     this.stage = staged ? new Stage(enlarge) : null;
     this.shown = this.stage ? [this.stage, ...this.views] : this.views;
     byId("cameras").replaceChildren(...this.shown.map((view) => view.figure));
@@ -268,11 +295,17 @@ export class Cameras {
     show(byId("tabs"), names.length > 1);
   }
 
-  /** @param {string} name @param {boolean} open whether the 3D view is to open */
-  #enlarge(name, open) {
+  /** Make a view large; once more: alone, and in all its pixels. @param {string} name @param {boolean} clicked not at first */
+  #enlarge(name, clicked) {
+    const alone = clicked && name === this.large && !this.alone;
     this.large = name;
-    if (open && name === this.stage?.name) this.stage.open();
-    for (const view of this.shown) view.figure.classList.toggle("large", view.name === name);
+    this.alone = alone;
+    if (clicked && name === this.stage?.name) this.stage.open();
+    for (const view of this.shown) {
+      view.figure.classList.toggle("large", view.name === name);
+      show(view.figure, !alone || view.name === name);
+    }
+    for (const view of this.views) view.full = alone && view.name === name;
     choose(byId("tabs"), name);
     this.#place();
   }
@@ -293,6 +326,7 @@ export class Cameras {
       const [left, top, w, h] = boxes[k];
       Object.assign(figure.style, { left: `${left}px`, top: `${top}px`, width: `${w}px`, height: `${h}px` });
     });
+    this.#watch();
   }
 
   /** @param {IntersectionObserverEntry[]} entries */
@@ -306,7 +340,8 @@ export class Cameras {
 
   #watch() {
     const visible = document.visibilityState === "visible";
-    this.pictures.watch(this.views.filter((view) => visible && view.visible).map((view) => view.name));
+    const seen = this.views.filter((view) => visible && view.visible);
+    this.pictures.watch(Object.fromEntries(seen.map((view) => [view.source, view.wanted])));
   }
 }
 

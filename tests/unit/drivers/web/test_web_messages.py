@@ -55,8 +55,8 @@ def take(text: str) -> object:
             )
             for name, value in (("robot", "panda"), ("speed", 0.25), ("frame", "tcp"), ("scene", "reset"))
         ),
-        ({"type": "watch", "cameras": ["wrist", "wrist", "scene"]}, WatchRequest(("wrist", "scene"))),
-        ({"type": "watch", "cameras": []}, WatchRequest(())),
+        ({"type": "watch", "cameras": {"wrist": 640, "scene": 1}}, WatchRequest({"wrist": 640, "scene": 1})),
+        ({"type": "watch", "cameras": {}}, WatchRequest({})),
         ({"type": "drawn", "camera": "scene"}, PictureDrawn("scene")),
     ],
 )
@@ -125,9 +125,10 @@ def with_axis(value: str) -> str:
             for value in values
         ),
         '{"type":"setting","name":"speed","value":0.5,"robot":"panda"}',
-        '{"type":"watch","cameras":"scene"}',
-        '{"type":"watch","cameras":["scene","attic"]}',
-        '{"type":"watch","cameras":[["scene"]]}',
+        '{"type":"watch","cameras":["scene"]}',
+        '{"type":"watch","cameras":{"scene":640,"attic":640}}',
+        '{"type":"watch","cameras":{"scene":0}}',
+        '{"type":"watch","cameras":{"scene":NaN}}',
         '{"type":"drawn","camera":0}',
         "[" * MAX_BYTES,
         '{"a":' * (MAX_BYTES // 5),

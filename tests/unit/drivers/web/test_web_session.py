@@ -231,7 +231,7 @@ def test_every_page_stops_and_only_the_driver_recovers_and_plays(room: Room) -> 
     "message",
     [
         {"type": "recover", "robot": "iiwa"},
-        {"type": "watch", "cameras": []},
+        {"type": "watch", "cameras": {}},
         {"type": "drawn", "camera": "scene"},
         {"type": "pad", "seen": 100.5, "since": 0, "axes": [0] * 8, "buttons": 0, "hands": {}},
     ],
