@@ -192,7 +192,7 @@ class ReplayRun:
     def _print_results(self, reason: str, ticks: int, missed: int) -> None:
         from hal.types import Limited
 
-        player = self.player
+        player, by_speed = self.player, Limited.SPEED | Limited.TCP_SPEED
         if player.finished:
             self._announce(
                 f"replayed {player.trajectory.duration:.1f} s at {100 * player.speed:g} % speed; the arm is at rest"
@@ -202,7 +202,8 @@ class ReplayRun:
                 f"ENDED at {player.progress:.1f} of {player.trajectory.duration:.1f} s: {reason}; the arm is at rest"
             )
         if player.limited is not Limited.NONE:
-            self._announce(f"limits were hit ({player.limited}); a lower --speed may follow more exactly")
+            slower = "; a lower --speed may follow more exactly" if player.limited & by_speed else ""
+            self._announce(f"limits were hit ({player.limited}){slower}")
         if missed > MANY_MISSED * ticks:
             self._announce(f"the servo missed {missed} of {ticks} ticks: this computer is overloaded")
         self._announce("deviation of the measured motion from the recorded one:")

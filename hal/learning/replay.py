@@ -41,6 +41,10 @@ _FINGERS_REST = 0.01
 """Speed of a width up to which the fingers count as resting, m/s."""
 _ARM_RESTS = 0.02
 """Speed of the joints up to which the arm counts as resting, rad/s."""
+_SAME_TCP = 0.01
+"""Distance between the recorded tcp and the arm's own from which on the tool is another one, m."""
+_OUTSIDE = 1e-3
+"""Distance by which the tcp may leave the workspace, m."""
 _OBJECT = "rig.object."
 
 
@@ -154,7 +158,11 @@ class RecordedTrajectory:
             raise CommandError(f"speed must be above 0 and at most 1, not {speed:g}", code="bad_speed")
         problems = self._check_arm(robot)
         if not problems:
-            problems = self._check_rows() or [*self._check_limits(robot), *self._check_speed(robot, speed)]
+            problems = self._check_rows()
+        if not problems:
+            places = np.array([robot.kinematics.fk(q)[:3] for q in self.q_set])
+            problems = [*self._check_limits(robot), *self._check_tcp(robot, places)]
+            problems += self._check_speed(robot, speed, places)
         if problems:
             raise CommandError(f"{robot.name} cannot replay this: " + "; ".join(problems), code="cannot_replay")
 
@@ -187,27 +195,49 @@ class RecordedTrajectory:
                 found.append(f"the fingers press with {force:g} N, and with at most {most:g} N here")
         return found
 
-    def _check_speed(self, robot: Robot, speed: float) -> list[str]:
+    def _check_tcp(self, robot: Robot, places: Array) -> list[str]:
+        """Describe a tcp that is not the recorded one, or leaves the workspace; ``places`` (k, 3) of it here, m."""
+        away = float(np.linalg.norm(np.array(robot.kinematics.fk(self.q[0])[:3]) - self.tcp[0]))
+        if away > _SAME_TCP:
+            return [f"its tcp is {1e3 * away:.0f} mm from this arm's: it was recorded with another gripper or tool"]
+        box = robot.spec.workspace
+        if box is None:
+            return []
+        past = np.maximum(places - np.maximum(box.upper, places[0]), np.minimum(box.lower, places[0]) - places)
+        row, axis = np.unravel_index(int(past.argmax()), past.shape)  # one that starts outside may come back in
+        if past[row, axis] <= _OUTSIDE:
+            return []
+        side = f"{box.lower[axis]:.3f} to {box.upper[axis]:.3f} m"
+        return [f"{'xyz'[axis]} of the tcp is {places[row, axis]:.3f} m at {self.t[row]:.2f} s, and may be {side} here"]
+
+    def _check_speed(self, robot: Robot, speed: float, places: Array) -> list[str]:
         """Describe a speed at which the servo would limit the motion, so that the arm would lag behind."""
-        most = robot.spec.speed * np.asarray(robot.limits.velocity)
-        share, row, worst = max(self._find_fastest(span, most) for span in _SPANS)
+        joints, tcp = robot.spec.speed * np.asarray(robot.limits.velocity), robot.spec.tcp_speed
+        found = []
+        for span in _SPANS:
+            rows, speeds = self._measure_speeds(self.q_set, span)
+            shares = np.abs(speeds) / joints
+            row, joint = np.unravel_index(int(shares.argmax()), shares.shape)
+            found.append((shares[row, joint], rows[row], self.joints[joint], joints[joint], "rad/s"))
+            shares = np.linalg.norm(self._measure_speeds(places, span)[1], axis=1) / tcp
+            row = shares.argmax()
+            found.append((shares[row], rows[row], "the tcp", tcp, "m/s"))
+        share, row, what, most, unit = max(found, key=lambda each: float(each[0]))
         if share * speed <= _SPEED_ROOM:
             return []
         return [
-            f"{self.joints[worst]} moves at {speed * share * most[worst]:.3f} rad/s at {self.t[row]:.2f} s, and may at "
-            f"{most[worst]:.3f} here: at speed {np.floor(100.0 / share) / 100.0:g} it could"
+            f"{what} moves at {speed * share * most:.3f} {unit} at {self.t[row]:.2f} s, and may at {most:.3f} here: at "
+            f"speed {np.floor(100.0 / share) / 100.0:g} it could"
         ]
 
-    def _find_fastest(self, span: float, most: Array) -> tuple[float, int, int]:
-        """Return the highest mean speed over ``span`` s, as a share of ``most``, with its first row and its joint."""
+    def _measure_speeds(self, values: Array, span: float) -> tuple[NDArray[np.intp], Array]:
+        """Return rows, and the mean speed of each of ``values`` (k, m) in ``span`` s from each of them on."""
         last = len(self.t) - 1
         ends = np.minimum(np.searchsorted(self.t, self.t + span - _ROUNDED), last)
         starts = np.flatnonzero(np.append(True, ends[:-1] < last))  # one span that reaches the end is enough
         ends = ends[starts]
         took = self.t[ends] - self.t[starts] + _JITTER
-        shares = np.abs(self.q_set[ends] - self.q_set[starts]) / took[:, None] / most
-        row, joint = np.unravel_index(int(shares.argmax()), shares.shape)
-        return float(shares[row, joint]), int(starts[row]), int(joint)
+        return starts, (values[ends] - values[starts]) / took[:, None]
 
     def interpolate(self, values: Array, s: float) -> Array:
         """Return the row of ``values``, one of the arrays above, interpolated at ``s``, s since the first row."""
@@ -322,6 +352,8 @@ _RAMP = 0.3
 """Time in which playback reaches its speed, s: a pause may have been in the middle of a motion."""
 _JOIN = 0.3
 """Shortest time in which the arm is brought from rest to the point at which it continues, s."""
+_LONGEST_JOIN = 2.0
+"""Longest such time, s: a chunk reaches no farther than 3 s ahead."""
 _LONGEST_WAIT = 10.0
 """Time after which fingers that have not come to rest end the playback, s."""
 _SETTLE = 0.5
@@ -504,7 +536,8 @@ class TrajectoryPlayer:
         state, spec = self.robot.state(), self.robot.spec
         away = np.abs(self.trajectory.interpolate(self.trajectory.q_set, self.progress) - state.q_set)
         slowly = spec.move_speed * np.asarray(spec.limits.velocity)
-        return TimeScaling(now + _JOIN + 2.0 * float((away / slowly).max()), self.progress, self.speed)
+        joins = min(_JOIN + 2.0 * float((away / slowly).max()), _LONGEST_JOIN)
+        return TimeScaling(now + joins, self.progress, self.speed)
 
     def _send(self, control: Control, scaling: TimeScaling, now: float, first: bool) -> None:
         """Send the rows that are due from now on, and the one before."""

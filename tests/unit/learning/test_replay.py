@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -326,6 +327,7 @@ def test_what_cannot_be_replayed_is_refused_with_the_reason(episode: Recorded) -
             (replace(good, q_set=moved(20, 3, 0.5)), "panda_joint4 goes through .* its limits here"),
             (replace(good, q_set=moved(20, 3, np.nan)), "not a number"),
             (replace(good, t=good.t[:1], q_set=good.q_set[:1]), "nothing to replay"),
+            (replace(good, tcp=good.tcp + 0.03), "another gripper or tool"),
         ]
         for trajectory, text in wrong:
             with pytest.raises(hal.CommandError, match=text):
@@ -335,14 +337,25 @@ def test_what_cannot_be_replayed_is_refused_with_the_reason(episode: Recorded) -
                 TrajectoryPlayer(rig, arm, good, speed=speed)
 
 
-def test_what_is_too_fast_here_names_the_speed_that_is_not(episode: Recorded) -> None:
-    with opened("mock", overrides=[*BARE, "robots.panda.speed=0.05"]) as rig:
+@pytest.mark.parametrize("limit", ["speed", "tcp_speed"])
+def test_what_is_too_fast_here_names_the_speed_that_is_not(episode: Recorded, limit: str) -> None:
+    with opened("mock", overrides=[*BARE, f"robots.panda.{limit}=0.05"]) as rig:
         arm = rig.robots["panda"]
         trajectory = course_of(episode, arm)
         with pytest.raises(hal.CommandError, match="at speed [0-9.]+ it could") as refused:
             TrajectoryPlayer(rig, arm, trajectory)
         possible = float(str(refused.value).rpartition("at speed ")[2].split()[0])
         TrajectoryPlayer(rig, arm, trajectory, speed=possible)
+
+
+def test_what_leaves_the_workspace_here_is_refused(episode: Recorded) -> None:
+    low, high = np.sort(episode.columns["observation.tcp"][:, 2])[[0, -1]]
+    assert high - low > 0.02
+    for height, refused in ((high - 0.01, True), (low - 0.001, False)):
+        with opened("mock", overrides=[*BARE, f"robots.panda.workspace.table_height={height}"]) as rig:
+            trajectory = course_of(episode, rig.robots["panda"])
+            with pytest.raises(hal.CommandError, match="z of the tcp is") if refused else contextlib.nullcontext():
+                trajectory.check(rig.robots["panda"], 1.0)
 
 
 def test_an_arm_without_a_gripper_does_not_replay_one_that_has_it(episode: Recorded) -> None:
@@ -411,11 +424,11 @@ def driven(speed: float, late: float = 0.0, seconds: float = 3.0) -> Recorded:
     """A joint at ``speed``, there and back; single rows are measured up to ``late`` s late, as on a busy machine."""
     with opened("mock") as rig:
         arm = rig.robots["panda"]
-        start, joints, n = arm.state().q, arm.joints, arm.n
+        start, joints, n, place = arm.state().q, arm.joints, arm.n, arm.state().tcp.position
     t = np.arange(0.0, seconds, 1.0 / FPS)
     q = np.tile(np.append(start, 0.04), (len(t), 1))
     q[:, n - 1] += speed * (np.minimum(t, seconds / 2) - np.maximum(t - seconds / 2, 0.0))
-    tcp = np.tile([0.5, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    tcp = np.tile([*place, 1.0, 0.0, 0.0, 0.0], (len(t), 1))
     stamps = t + np.random.default_rng(1).uniform(0.0, late, len(t))
     columns = {"rig.setpoint": q, "observation.state": q, "observation.tcp": tcp}
     return Recorded(
