@@ -348,8 +348,10 @@ def check_report(path: str | None) -> None:
 
 def write_report(path: str | None, report: Mapping[str, Any]) -> None:
     """Write the file of ``--report``, if there is to be one."""
+    from hal.recording.layout import make_plain
+
     if path:
-        Path(path).write_text(json.dumps(report, indent=2) + "\n")
+        Path(path).write_text(json.dumps(make_plain(report), indent=2) + "\n")
 
 
 def robot_names(args: argparse.Namespace) -> list[str]:

@@ -282,10 +282,8 @@ def known_columns(layout: DatasetLayout) -> dict[str, list[str]] | None:
     return None
 
 
-def check_compatible(
-    layout: DatasetLayout, features: Mapping[str, Any], fps: int, robot_type: str, cameras: Sequence[CameraSetup]
-) -> None:
-    """Check whether episodes of this format can be added to a dataset.
+def check_compatible(layout: DatasetLayout, about: Mapping[str, Any], cameras: Sequence[CameraSetup]) -> None:
+    """Check whether episodes of this format, with this metadata, can be added to a dataset.
 
     Raises:
         CommandError: The dataset has another format (code ``other_dataset``; the message lists all differences), or
@@ -313,10 +311,10 @@ def check_compatible(
         raise CommandError(
             f"the dataset in {root} was not recorded by this program; choose a new folder", code="foreign_dataset"
         )
-    found = [*_settings(info, fps, robot_type), *_features(info["features"], features)]
+    found = format_differences(info, about)
     if last >= 0:
         kept = {camera.name: {"streams": camera.more, "depth_unit_m": camera.depth_unit} for camera in cameras}
-        found += camera_differences(read_about(layout, last)["cameras"], kept)
+        found += hardware_differences(read_about(layout, last), {**about, "cameras": kept})
     if found:
         raise CommandError(
             f"the dataset in {root} has another format: {'; '.join(found)}; choose a new folder", code="other_dataset"
@@ -367,11 +365,17 @@ def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:
     return f"the names of {key} differ: {'; '.join(parts) or 'their order is another'}"
 
 
-def camera_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    """Yield differences in the depth and the exact streams of cameras in both, which no feature shows.
+def hardware_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    """Yield differences in what no feature shows; the arguments are two episodes' metadata."""
+    yield from _camera_differences(old["cameras"], new["cameras"])
+    for arms in zip(*(about["rig"]["resolved"]["robots"] for about in (old, new)), strict=False):
+        there, here = ((arm.get("gripper") or {}).get("width_max") for arm in arms)
+        if there and here and not math.isclose(there, here, rel_tol=0.01):
+            yield f"the gripper of {arms[1]['name']} opens {there:g} m there, and {here:g} m here"
 
-    The arguments are ``cameras`` of two episodes' metadata.
-    """
+
+def _camera_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    """Yield differences in the depth and the exact streams of cameras in both."""
     exact = [name for name in MORE_STREAMS if STREAMS[name].exact]
     for camera in (name for name in new if name in old):
         streams, ours = (each[camera].get("streams") or () for each in (old, new))

@@ -482,3 +482,9 @@ def make_finite(data: Any) -> Any:
     if isinstance(data, (list, tuple)):
         return [make_finite(value) for value in data]
     return data
+
+
+def make_plain(data: Any) -> Any:
+    """Return data as JSON: NumPy's numbers and arrays as Python's, None for what is not finite, else texts."""
+    text = json.dumps(data, default=lambda value: value.tolist() if hasattr(value, "tolist") else str(value))
+    return make_finite(json.loads(text))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..errors import CommandError, DatasetError
 from .about import split_about
 from .changing import existing_episodes, refuse_foreign
-from .checking import camera_differences, format_differences
+from .checking import format_differences, hardware_differences
 from .codecs import Stats, column_stats, copy_records, merge_stacked, merge_stats, stats_as_lists
 from .dataset import Dataset, Episode
 from .finish import entries_table, entry_row, last_row, new_info, stats_of, stats_row, tasks_table, totals, write_table
@@ -246,8 +246,8 @@ def _sources(
             file = str(strays[0].relative_to(layout.root))
             raise DatasetError("belongs to no episode and would be lost: move it", file=file, code="index_wrong")
     for dataset in datasets[1:]:
-        cameras = (each.episodes[0].info["cameras"] for each in (datasets[0], dataset))
-        found = [*format_differences(datasets[0].info, dataset.info), *camera_differences(*cameras)]
+        about = (each.episodes[0].info for each in (datasets[0], dataset))
+        found = [*format_differences(datasets[0].info, dataset.info), *hardware_differences(*about)]
         if found:
             raise CommandError(
                 f"{datasets[0].root} (there) and {dataset.root} (here) differ: {'; '.join(found)}",

@@ -21,7 +21,7 @@ from ..learning.episode import stands_in_world
 from .checking import check_compatible, known_columns
 from .finish import write_mark
 from .index import read_index
-from .layout import DatasetLayout, features_of, lock_dataset, require_libraries
+from .layout import DatasetLayout, features_of, lock_dataset, make_plain, require_libraries
 from .live import RowQueue
 from .merging import pack_if_loose
 from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
@@ -159,7 +159,7 @@ class Recorder:
                 "encoder": encoder,
                 **rig_metadata(rig),
             }
-            check_compatible(DatasetLayout(out), self._about["features"], fps, self._about["robot_type"], setups)
+            check_compatible(DatasetLayout(out), self._about, setups)
         except BaseException:
             self._child.close()
             self._memory.close()
@@ -288,7 +288,7 @@ class Recorder:
         Args:
             success: Mark of the episode; written at once, so that it survives if the writer is killed.
             wait: Block until the episode is saved.
-            result: What else is known at the end, for the episode's metadata: anything that JSON can hold.
+            result: What else is known at the end, for the episode's metadata: as JSON, arrays as lists.
 
         Raises:
             CommandError: No episode is open (code ``no_episode``); with ``wait``, no row was recorded (``no_rows``).
@@ -414,7 +414,7 @@ class EpisodeRecorder:
             "gaps": self.dropped.as_json(),
             "repeated": {buffer.camera.name: buffer.repeated for buffer in self._buffers},
             "trouble": self.trouble,
-            "result": dict(result or {}),
+            "result": make_plain(dict(result or {})),
         }
 
     def _read(self) -> RowSnapshot | Exception:

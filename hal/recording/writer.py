@@ -125,7 +125,7 @@ class EpisodeWriter:
         self._lock.enter_context(lock_dataset(layout))
         notes = recover_all(layout)
         cameras = [CameraSetup(*camera) for camera in about["cameras_kept"]]
-        check_compatible(layout, about["features"], about["fps"], about["robot_type"], cameras)
+        check_compatible(layout, about, cameras)
         info = read_index(layout)
         check_next_episode(layout, info)
         number = int(info["total_episodes"]) if info is not None else 0

@@ -41,6 +41,9 @@ class Reach:
         away = goal(self.rig) - observation.robots["panda"].tcp_set.position
         return hal.Twist(away * min(2.0, 0.15 / np.linalg.norm(away))), 0.0
 
+    def statistics(self):
+        return {"mean": np.float32(0.5), "worst": np.array([np.nan])}
+
 
 def goal(rig):
     cube = rig.robots["panda"].base.inverse() @ rig.world.pose("cube")
@@ -165,6 +168,7 @@ def test_episodes_are_recorded(folder: Path) -> None:
     for episode, told in zip(episodes, report(folder)["episodes"], strict=True):
         assert episode.length / 30 == pytest.approx(told["seconds"], abs=1.0)
         assert np.ptp(episode.columns["observation.tcp"][:, 0]) > 0.05
+        assert episode.info["result"]["policy"] == told["policy"] == {"mean": 0.5, "worst": [None]}
 
 
 def test_buttons_of_the_pad_mark_an_episode(folder: Path) -> None:

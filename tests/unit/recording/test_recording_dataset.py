@@ -178,6 +178,15 @@ def test_depth_in_another_unit_is_another_kind(made: Path, tmp_path: Path) -> No
         Recorder(rig, copy)
 
 
+def test_another_gripper_is_another_kind(made: Path) -> None:
+    hand = "robots.panda.gripper=robotiq_2f85"
+    with (
+        mock_rig("lock_step", hand) as rig,
+        pytest.raises(CommandError, match=r"opens 0\.08 m there, and 0\.085 m here"),
+    ):
+        Recorder(rig, made)
+
+
 def test_only_differing_names_are_reported(made: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(made, copy)
