@@ -1,4 +1,4 @@
-"""Show a dataset: its statistics, a page to mark and delete, an episode as a picture or for rerun; check and repair it.
+"""Show a dataset: its statistics, a page to edit it, an episode as a picture or for rerun; check and repair it.
 
 hal review data/demo
 hal review data/demo --page
@@ -66,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
         nargs="?",
         const=0,
         metavar="PORT",
-        help="serve a page to rank, look at, mark and delete episodes, to this computer only, until Ctrl-C",
+        help="serve a page to rank, look at, replay, mark and delete episodes, to this computer only, until Ctrl-C",
     )
     files.add_argument(
         "--repair",

@@ -92,6 +92,10 @@ class DriverSpec:
     their emulators share, as a :class:`~hal.world.WorldDriver`, or None."""
     viewer3d: str | None = None
     """A page with the arms in 3D: :class:`~hal.views.Viewer3D`."""
+    replay3d: str | None = None
+    """"module:function" that returns a page, a text that needs nothing else, which replays a recording in 3D. Its
+    arguments are the arms' and the world's records and an iterable of :class:`~hal.views.ReplayFrame`; it raises
+    HalError for what cannot be drawn."""
     pictures: str | None = None
     """Renderer of all simulated cameras of a rig: :class:`~hal.views.CameraRenderer`."""
     software_renderer: str | None = None
@@ -150,7 +154,7 @@ class DriverSpec:
         return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
-_VIEWS = ("viewer3d", "pictures", "software_renderer", "console")
+_VIEWS = ("viewer3d", "replay3d", "pictures", "software_renderer", "console")
 _KINDS = ("robot", "gripper", "camera", "gamepad", "leader", "world", *_VIEWS)
 
 

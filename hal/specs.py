@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import types as _types
 import typing
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import Any, TypeVar
@@ -183,6 +184,13 @@ class RobotSpec:
     """The rig's file, or ``<dict>``."""
     at: str | None = None
     """Address of the computer that serves this arm; None if it is at this one."""
+
+    def joint_positions(self, q: Iterable[float], width: float | None) -> dict[str, float]:
+        """Return the positions of the arm's joints, and of its gripper's at a width, m, by their names."""
+        found = dict(zip(self.joints, q, strict=True))
+        if self.gripper is not None and width is not None:
+            found |= dict(zip(self.gripper.joints, self.gripper.finger_positions(width), strict=True))
+        return found
 
 
 @dataclass(frozen=True)

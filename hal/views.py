@@ -283,6 +283,19 @@ class CameraRenderer(WorldView):
         """Return what the driver of this camera takes its images from."""
 
 
+class ReplayFrame(NamedTuple):
+    """What a rig does at one time of a recording."""
+
+    wait: float
+    """Time since the frame before, s."""
+    joints: dict[str, dict[str, float]]
+    """Positions of the joints of each arm and its gripper, rad or m, by name."""
+    tcp_set: dict[str, Pose]
+    """Commanded pose of each arm's tcp, base frame."""
+    bodies: dict[str, Sequence[float]]
+    """Pose (7,) of each object in the world."""
+
+
 class Viewer3D(WorldView):
     """A rig's arms in 3D on the console's page, with a draggable handle on each tcp."""
 

@@ -236,13 +236,28 @@ class DrawnWorld:
                     pose = pose @ Pose.from_matrix(self._link(body, spec.kinematics.base_link)).inverse()
                 self._values[base] = *pose.position, *pose.orientation
         self._frames = None
-        for body, base in zip(bodies, self._base_at, strict=True):
+        self._carry()
+
+    def _carry(self) -> None:
+        """Place what arms carry on their links."""
+        for body, base in zip(self.bodies.values(), self._base_at, strict=True):
             spec = body.spec
             if isinstance(spec, BodySpec) and spec.robot in self.bodies:
                 here = Pose.from_matrix(self._link(self.bodies[spec.robot], spec.link))
                 pose = here @ Pose(spec.position, spec.orientation)
                 self._values[base] = *pose.position, *pose.orientation
         self._frames = None
+
+    def place(self, bodies: Mapping[str, Sequence[float]], arms: Mapping[str, Mapping[str, float]]) -> None:
+        """Place bodies (7,) in the world, and the joints of arms, rad or m, with what they carry; the others stay."""
+        joints = dict(zip(self._joint_rows.tolist(), self._joint_at.tolist(), strict=True))
+        for body, base in zip(self.bodies.values(), self._base_at, strict=True):
+            if body.name in bodies:
+                self._values[base] = bodies[body.name]
+            for name in arms.get(body.name, {}).keys() & set(body.movable):
+                self._values[joints[self._joint_of[body.id, name]]] = arms[body.name][name]
+        self._frames = None
+        self._carry()
 
     def _compute(self) -> Array:
         """Return the frames (N, 4, 4) of all links in the world."""
@@ -401,8 +416,6 @@ def _single(rgba: Sequence[float]) -> tuple[float, ...]:
 
 def _initial_joints(spec: RobotSpec, movable: Sequence[str]) -> dict[str, float]:
     """Return the initial position of each movable joint of an arm: its gripper is open."""
-    fingers = spec.gripper.joints if spec.gripper is not None else ()
-    values = dict.fromkeys(movable, 0.0) | dict(zip(spec.joints, spec.initial, strict=True))
-    if spec.gripper is not None:
-        values |= dict(zip(fingers, spec.gripper.finger_positions(spec.gripper.width_max), strict=True))
+    width = spec.gripper.width_max if spec.gripper is not None else None
+    values = dict.fromkeys(movable, 0.0) | spec.joint_positions(spec.initial, width)
     return {name: value for name, value in values.items() if name in movable}

@@ -7,5 +7,6 @@ from hal.registry import DriverSpec
 DRIVER = DriverSpec(
     name="viser",
     viewer3d="hal.drivers.viser.viewer:ViserViewer",
+    replay3d="hal.drivers.viser.replay:write_replay",
     requires={"viser": "pip install 'robot-hal[viewer]'"},
 )

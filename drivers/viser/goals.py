@@ -30,10 +30,7 @@ class DraggedGoal(NamedTuple):
     """Number of the drag event; never the same twice."""
     page: int
     """Number of the page that drags it."""
-    position: tuple[float, ...]
-    """(3,) m."""
-    orientation: tuple[float, ...]
-    """(4,) unit quaternion x, y, z, w."""
+    pose: Pose
 
 
 def checked_pose(position: Sequence[float], orientation: Sequence[float]) -> Pose | None:
@@ -53,7 +50,7 @@ class HandleDrag:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._seq = 0
         self._goal: DraggedGoal | None = None
         self._owner = 0
@@ -85,7 +82,7 @@ class HandleDrag:
             if pose is None or not self._grabbed or page != self._owner:
                 return False
             self._seq += 1
-            self._goal = DraggedGoal(self._seq, page, tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
+            self._goal = DraggedGoal(self._seq, page, pose)
             self._used, self._nearest = now, inf
             return True
 
@@ -99,15 +96,12 @@ class HandleDrag:
         """Clear the goal of a page that was closed, or whose connection is lost."""
         with self._lock:
             if page == self._owner:
-                self._clear()
+                self.clear()
 
     def clear(self) -> None:
         """Clear the goal. A drag under way counts again only after the handle is released and grabbed."""
         with self._lock:
-            self._clear()
-
-    def _clear(self) -> None:
-        self._goal, self._owner, self._grabbed = None, 0, False
+            self._goal, self._owner, self._grabbed = None, 0, False
 
     def update(self, now: float, tcps: Sequence[Pose], *, tripped: bool) -> None:
         """Clear the goal where it is reached, unused, or older than a trip.
@@ -121,15 +115,14 @@ class HandleDrag:
         """
         with self._lock:
             if tripped and not self._tripped:
-                self._clear()
+                self.clear()
             self._tripped = tripped
             if self._goal is None:
                 return
-            goal = Pose(self._goal.position, self._goal.orientation)
-            distances = [tcp.distance(goal) for tcp in tcps]
+            distances = [tcp.distance(self._goal.pose) for tcp in tcps]
             nearest = min(distance + 0.2 * angle for distance, angle in distances)
             if nearest < self._nearest - _APPROACH:
                 self._used, self._nearest = now, nearest
             near = any(distance <= REACHED_DISTANCE and angle <= REACHED_ANGLE for distance, angle in distances)
             if (near and not self._grabbed) or now - self._used > UNUSED:
-                self._clear()
+                self.clear()

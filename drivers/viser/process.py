@@ -16,8 +16,8 @@ import viser
 import websockets.asyncio.server
 from viser import ClientHandle, GuiEvent, ViserServer
 
+from hal.drivers.scene.mirror import WorldMirror
 from hal.errors import HalError, NotSupported
-from hal.geometry import Pose
 from hal.host.hosts import SNAPSHOT_CAPACITY
 from hal.host.memory import SeriesBox
 from hal.host.process import Channel, SharedMemory, serve
@@ -26,7 +26,7 @@ from hal.host.scheduling import yield_to_others
 from hal.kinematics.collisions import in_one_place
 from hal.specs import CollisionSpec, GroupSpec, from_json
 
-from .scene import PAGE, ArmView, BodiesView
+from .scene import PAGE, ArmView, BodiesView, DrawnArm
 from .shapes import ShapesView
 
 _NICE = 10
@@ -111,27 +111,26 @@ class ViewerPage:
         self._sent: dict[str, int] = {}
         """Numbers of the goals that were sent last."""
         self.world: BodiesView | None = None
+        self._mirror: WorldMirror | None = None
         self.arms: list[ArmView] = []
         found = [GroupMemory.of(shared.buffer, group) for group, shared in zip(groups, memories, strict=True)]
         grippers = {name: mail for memory in found for name, mail in memory.grippers.items()}
         for group, shared, memory in zip(groups, memories, found, strict=True):
             for robot in group.robots:
                 mail, gripper = memory.robots[robot.name], grippers[robot.gripper.name] if robot.gripper else None
-                try:
-                    self.arms.append(ArmView(server.scene, robot, mail, gripper, self.notes))
-                except (OSError, ValueError) as error:
-                    raise HalError(f"{robot.name} cannot be drawn: {error}", code="not_drawable") from error
+                self.arms.append(ArmView(server.scene, robot, mail, gripper, self.notes))
             if group.world is not None:
                 snapshots = SeriesBox(shared.buffer[GroupMemory.size_of(group) :], SNAPSHOT_CAPACITY)
                 try:
-                    self.world = BodiesView(server.scene, group.world, snapshots, self.notes)
+                    self.world = BodiesView(server.scene, group.world, self.notes)
+                    self._mirror = WorldMirror(self.world.world, snapshots)
                 except HalError as error:
                     self.notes.append(f"the world is not drawn: {error}")
         self._shapes = self._draw_shapes(groups)
         bodies = [body for group in groups if group.world is not None for body in group.world.bodies]
         if not any(body.shape == "plane" and body.visible for body in bodies):
             server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
-        _set_camera(server, [arm.spec.base_position for arm in self.arms])
+        set_camera(server, self.arms)
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="small")
         server.gui.main_panel.minimize()
         reset_button = server.gui.add_button("Reset gizmo", hint="Put it back to the tool, and clear its goal.")
@@ -181,13 +180,13 @@ class ViewerPage:
         if numbers == self._sent and (not goals or now < self._report_due):
             return
         self._sent, self._report_due = numbers, now + _REPEAT
-        poses = {robot: [goal.seq, goal.page, *goal.position, *goal.orientation] for robot, goal in goals.items()}
-        channel.send({"goals": poses, "t": now})
+        poses = {name: (*goal.pose.position.tolist(), *goal.pose.orientation.tolist()) for name, goal in goals.items()}
+        channel.send({"goals": {name: [goal.seq, goal.page, *poses[name]] for name, goal in goals.items()}, "t": now})
 
     def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Note an edit of the simulated world; it is shown with the snapshot of its revision."""
-        if self.world is not None:
-            self.world.note_edit(method, params, revision)
+        if self._mirror is not None:
+            self._mirror.note_edit(method, params, revision)
 
     def update(self) -> None:
         """Read the states of the arms, and show them if a page is open."""
@@ -199,8 +198,9 @@ class ViewerPage:
                 arm.update()
             if now >= self._due:
                 self._due = now + _WORLD_PERIOD
-                if self.world is not None:
-                    self.world.update(watched=watched)
+                moved = self._mirror is not None and self._mirror.update() is not None
+                if watched and moved and self.world is not None:
+                    self.world.show()
                 if watched:
                     self._show_shapes()
 
@@ -210,13 +210,12 @@ class ViewerPage:
             shapes, state, goal = self._shapes.get(arm.spec.name), arm.state, arm.drag.goal
             if shapes is not None and state is not None:
                 shapes.show_near(states)
-                shapes.show_ghost(arm.mail, state, None if goal is None else Pose(goal.position, goal.orientation))
+                shapes.show_ghost(arm.mail, state, None if goal is None else goal.pose)
 
 
-def _set_camera(server: ViserServer, bases: Sequence[Sequence[float]]) -> None:
+def set_camera(server: ViserServer, arms: Sequence[DrawnArm]) -> None:
     """Show all arms from the front and a little above."""
-    middle = np.mean(bases, axis=0) if bases else np.zeros(3)
-    target = middle + (0.3, 0.0, 0.2)
+    target = np.mean([arm.spec.base_position for arm in arms] or [(0.0, 0.0, 0.0)], axis=0) + (0.3, 0.0, 0.2)
     server.initial_camera.look_at = tuple(target)
     server.initial_camera.position = tuple(target + (1.2, -1.2, 0.6))
     server.initial_camera.fov = 0.75

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
 from hal.drivers.scene.drawn import DrawnBody, DrawnWorld, link_visual
-from hal.drivers.scene.mirror import WorldMirror
 from hal.drivers.scene.shapes import Visual
 from hal.drivers.scene.urdf_files import absent_packages, drawn_visuals, where_to_get
+from hal.errors import HalError
 from hal.geometry import Pose, matrix_to_quaternion
-from hal.host.memory import SeriesBox
 from hal.host.records import GripperMail, RobotMail
 from hal.kinematics.urdf import UrdfJoint, UrdfModel, read_urdf
 from hal.specs import BodySpec, RobotSpec, WorkspaceSpec, WorldSpec
@@ -38,33 +37,19 @@ _AT_REST = 1e-5
 """A node that moves by less is not updated, m and parts of a quaternion: an arm at rest costs no messages."""
 
 
-class ArmView:
-    """One arm, drawn from its mailboxes: links, set-point, workspace, and the handle on its tcp.
+class DrawnArm:
+    """One arm: links, set-point, workspace. Every node is a child of the frame of the arm's base."""
 
-    Every node is a child of the frame of the arm's base.
-    """
+    def __init__(self, scene: SceneApi, spec: RobotSpec, notes: list[str]) -> None:
+        """Draw the arm in ``scene``; ``notes`` gets a line for everything that cannot be drawn.
 
-    def __init__(
-        self, scene: SceneApi, spec: RobotSpec, mail: RobotMail, gripper: GripperMail | None, notes: list[str]
-    ) -> None:
-        """Draw the arm.
-
-        Args:
-            scene: The scene to draw it in.
-            spec: The arm.
-            mail: The arm's mailboxes in its host's memory.
-            gripper: Those of its gripper, if it has one.
-            notes: Gets a line for everything that cannot be drawn.
-
-        Raises:
-            ValueError: Its URDF is wrong.
-            OSError: Its URDF cannot be read.
+        Raises HalError for a URDF that is wrong or cannot be read (code ``not_drawable``).
         """
         self.spec = spec
-        self.mail = mail
-        self.gripper = gripper
-        self.drag = HandleDrag()
-        urdf = _read_urdf(spec.urdf)
+        try:
+            urdf = read_urdf(Path(spec.urdf), meshes=False)  # a mesh that cannot be drawn becomes a note
+        except (OSError, ValueError) as error:
+            raise HalError(f"{spec.name} cannot be drawn: {spec.urdf}: {error}", code="not_drawable") from error
         root = f"/arms/{spec.name}"
         scene.add_frame(
             root,
@@ -79,6 +64,25 @@ class ArmView:
             lines = workspace_lines(spec.workspace)
             if len(lines):
                 scene.add_line_segments(f"{root}/workspace", lines, _AMBER, thickness=0.003)
+
+    def place(self, joints: Mapping[str, float], tcp_set: Pose) -> None:
+        """Move the joints, rad or m, and the frame of the set-point to a pose in the base frame."""
+        for joint, node in self._links:
+            move_node(node, *joint.placement(joints))
+        move_node(self._set, tcp_set.position, tcp_set.orientation)
+
+
+class ArmView(DrawnArm):
+    """An arm that is drawn from its mailboxes, and the handle on its tcp."""
+
+    def __init__(
+        self, scene: SceneApi, spec: RobotSpec, mail: RobotMail, gripper: GripperMail | None, notes: list[str]
+    ) -> None:
+        """Draw the arm; ``mail`` and ``gripper`` are its mailboxes in its host's memory, and those of its gripper."""
+        super().__init__(scene, spec, notes)
+        self.mail = mail
+        self.gripper = gripper
+        self.drag = HandleDrag()
         self.state: RobotState | None = None
         self._scene = scene
         self._handle = self._new_handle()
@@ -114,14 +118,9 @@ class ArmView:
         state = self.state
         if state is None:
             return
-        values = dict(zip(self.spec.joints, state.q.tolist(), strict=True))
         gripper = self.gripper.get() if self.gripper is not None else None
-        if gripper is not None and self.spec.gripper is not None:
-            positions = self.spec.gripper.finger_positions(gripper.state.width)
-            values |= dict(zip(self.spec.gripper.joints, positions, strict=True))
-        for joint, node in self._links:
-            move_node(node, *joint.placement(values))
-        move_node(self._set, state.tcp_set.position.tolist(), state.tcp_set.orientation.tolist())
+        width = None if gripper is None else gripper.state.width
+        self.place(self.spec.joint_positions(state.q.tolist(), width), state.tcp_set)
         self._update_handle(state)
 
     def _update_handle(self, state: RobotState) -> None:
@@ -133,7 +132,7 @@ class ArmView:
             self._handle = self._new_handle()
         with suppress(ValueError):  # sent just now by a page; the next update corrects it
             if goal is not None:  # for a second page, and for one whose drag was refused
-                move_node(self._handle, goal.position, goal.orientation)
+                move_node(self._handle, goal.pose.position, goal.pose.orientation)
             elif free:
                 move_node(self._handle, state.tcp.position.tolist(), state.tcp.orientation.tolist())
 
@@ -162,28 +161,25 @@ def _draw_links(
 
 
 def workspace_lines(workspace: WorkspaceSpec) -> NDArray[np.float32]:
-    """Return (n, 2, 3) line segments around each bounded side of a workspace, in the base frame, m.
+    """Return (n, 2, 3) line segments, the edges of all bounded sides of a workspace, in the base frame, m.
 
     Open sides are cut off near the base.
     """
-    low = np.clip(workspace.lower, -_OPEN_SIDE, _OPEN_SIDE)
-    high = np.clip(workspace.upper, -_OPEN_SIDE, _OPEN_SIDE)
-    segments = []
-    for axis in range(3):
-        a, b = (axis + 1) % 3, (axis + 2) % 3
-        for bound, drawn in ((workspace.lower[axis], low), (workspace.upper[axis], high)):
-            if drawn[axis] == bound:
-                ring = np.full((5, 3), bound)
-                ring[:, a] = low[a], high[a], high[a], low[a], low[a]
-                ring[:, b] = low[b], low[b], high[b], high[b], low[b]
-                segments.append(np.stack((ring[:-1], ring[1:]), axis=1))
+    bounds = np.array([workspace.lower, workspace.upper])
+    ends, segments = np.clip(bounds, -_OPEN_SIDE, _OPEN_SIDE), []
+    for axis, first, second in itertools.product(range(3), (0, 1), (0, 1)):
+        sides = [first, second], [(axis + 1) % 3, (axis + 2) % 3]
+        if (ends[sides] == bounds[sides]).any():
+            segment = ends.copy()
+            segment[:, sides[1]] = ends[sides]
+            segments.append(segment)
     return np.asarray(segments, np.float32).reshape(-1, 2, 3)
 
 
 class BodiesView:
     """All bodies of a simulated world, drawn and posed as its cameras show them."""
 
-    def __init__(self, scene: SceneApi, spec: WorldSpec, snapshots: SeriesBox, notes: list[str]) -> None:
+    def __init__(self, scene: SceneApi, spec: WorldSpec, notes: list[str]) -> None:
         """Draw the bodies of ``spec``; ``notes`` gets a line for everything that cannot be drawn.
 
         Raises:
@@ -191,39 +187,30 @@ class BodiesView:
         """
         self._scene = scene
         self._notes = notes
-        self._world = DrawnWorld(spec)
-        self._mirror = WorldMirror(self._world, snapshots)
+        self.world = DrawnWorld(spec)
         self._revision = -1
         self._drawn: dict[str, tuple[DrawnBody, tuple[Visual, ...], list[SceneNodeHandle]]] = {}
         """Name of a body -> the body, its shapes as they are drawn, and the frames of its links."""
-        notes += self._world.notes
-        self._show()
+        notes += self.world.notes
+        self.show()
 
-    def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
-        """Note an edit of the world; it is repeated here before the first snapshot of its revision is shown."""
-        self._mirror.note_edit(method, params, revision)
-
-    def update(self, *, watched: bool) -> None:
-        """Follow the world, and update the page if one is open."""
-        if self._mirror.update() is not None and watched:
-            self._show()
-
-    def _show(self) -> None:
-        if self._revision != self._world.revision:
-            self._revision = self._world.revision
+    def show(self) -> None:
+        """Show the bodies where they are in :attr:`world`."""
+        if self._revision != self.world.revision:
+            self._revision = self.world.revision
             self._draw_changes()
         for body, _, nodes in self._drawn.values():
-            frames = self._world.link_frames([(body.id, link) for link in range(len(nodes))])
+            frames = self.world.link_frames([(body.id, link) for link in range(len(nodes))])
             for node, frame in zip(nodes, frames, strict=True):
                 move_node(node, frame[:3, 3], matrix_to_quaternion(frame[:3, :3]))
 
     def _draw_changes(self) -> None:
         """Draw the bodies that are new or look different, and remove those that are gone."""
         for name, (body, visuals, _) in tuple(self._drawn.items()):
-            if self._world.bodies.get(name) is not body or body.visuals is not visuals:
+            if self.world.bodies.get(name) is not body or body.visuals is not visuals:
                 del self._drawn[name]
                 self._scene.remove_by_name(f"/bodies/{name}")
-        for name, body in self._world.bodies.items():
+        for name, body in self.world.bodies.items():
             if name not in self._drawn and isinstance(body.spec, BodySpec) and body.spec.visible:
                 self._drawn[name] = body, body.visuals, self._draw(body, body.spec)
 
@@ -240,14 +227,6 @@ class BodiesView:
             shapes = [visual for visual in body.visuals if visual.link == link]
             _draw_visuals(self._scene, f"{root}/{link}", shapes, self._notes)
         return nodes
-
-
-def _read_urdf(path: str) -> UrdfModel:
-    """Read a URDF. Raises ValueError, which names the file, or OSError."""
-    try:
-        return read_urdf(Path(path), meshes=False)  # a mesh that cannot be drawn becomes a note
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def shown_visuals(urdf: UrdfModel, name: str, notes: list[str]) -> dict[str, list[Visual]]:

@@ -377,6 +377,12 @@ class Episode:
                 found[stream] = self._layout.depth(f"{camera}_{stream}", self.number)
         return found
 
+    def file_versions(self) -> tuple[tuple[int, int] | None, ...]:
+        """Return numbers that change when a file of the episode is written anew."""
+        self._follow()
+        pictures = (path for camera in self.cameras for path in self.files(camera).values())
+        return tuple(map(file_version, (self._about_file, self._layout.root / self.data_file, *pictures)))
+
     def first_picture(self, video: Path) -> int:
         """Return the number of the episode's first picture in a video of :meth:`files`."""
         return self.place.video(video.parent.parent.name.removeprefix(video_key("")))[1]

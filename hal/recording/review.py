@@ -176,9 +176,8 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
     times: dict[str, _Times] = {}
     for episode in dataset.episodes if episodes is None else episodes:
         try:
-            line, columns, stamps = _line(episode), episode.columns, episode.stamps
+            line, columns, stamps = measure_episode(episode), episode.columns, episode.stamps
             parts = columns[STATE], columns[ACTION]
-            episode.check_pictures()
         except DatasetError as error:
             broken.append(str(error))
             continue
@@ -213,7 +212,9 @@ def summary_as_json(found: DatasetSummary) -> str:
     return json.dumps(make_finite(asdict(found)), indent=2)
 
 
-def _line(episode: Episode) -> EpisodeSummary:
+def measure_episode(episode: Episode) -> EpisodeSummary:
+    """Read every row of an episode, and count its pictures. Raises DatasetError."""
+    episode.check_pictures()
     status, names = episode.columns["rig.status"], episode.names("rig.status")
     trips = 0
     for k, name in enumerate(names):
@@ -356,13 +357,10 @@ def _photos(
     """Draw pictures evenly spaced in time, the first and the last among them."""
     shown = np.unique(np.linspace(0, content.rows - 1, _PHOTOS).round().astype(int)).tolist()
     canvas.text(_MARGIN, y, stream.camera, 14)
-    place = 0
-    for k, picture in enumerate(stream):
-        if k in shown:
-            x = _MARGIN + place * (width + _BETWEEN)
-            canvas.photo(x, round(y) + 18, picture, width, height)
-            canvas.text(x + width, y + 16, f"{content.grid[k]:.2f} s", 12, GREY, "rs")
-            place += 1
+    for place, k in enumerate(shown):
+        x = _MARGIN + place * (width + _BETWEEN)
+        canvas.photo(x, round(y) + 18, content.episode.frame(stream.camera, k), width, height)
+        canvas.text(x + width, y + 16, f"{content.grid[k]:.2f} s", 12, GREY, "rs")
     return y + height + 30
 
 

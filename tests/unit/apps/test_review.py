@@ -11,6 +11,10 @@ from app_kit import Done, run_here
 from recording_kit import join_metadata, make_recording
 
 from hal.apps import export, review
+from hal.errors import HalError
+from hal.recording import Dataset, Episode, mark_episodes, review_page
+from hal.recording.review import EpisodeSummary, measure_episode
+from hal.recording.review_page import ReviewServer, write_replay
 
 
 @pytest.fixture(scope="module")
@@ -152,3 +156,45 @@ def test_a_damaged_index_is_a_warning(tmp_path: Path, file: str) -> None:
     assert warning.endswith(f"hal review {root} --repair")
     assert run(root, "--repair").returncode == 0
     assert run(root).stderr == ""
+
+
+def test_the_page_reads_an_episode_again_only_after_another_program_changed_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, read = make_recording(tmp_path / "demo").root, list[int]()
+
+    def measure(episode: Episode) -> EpisodeSummary:
+        read.append(episode.number)
+        return measure_episode(episode)
+
+    monkeypatch.setattr(review_page, "measure_episode", measure)
+    with ReviewServer(root, 0, b"") as server:
+
+        def lines() -> list[int]:
+            """Return which episodes are read for a list that is as one of a new server."""
+            read.clear()
+            assert [server.measure_episode(one) for one in server.read_dataset().episodes] == [
+                measure_episode(one) for one in Dataset(root).episodes
+            ]
+            return read
+
+        assert lines() == [0, 1, 2]
+        assert lines() == []
+        mark_episodes(root, {2: True})
+        assert lines() == [2]
+        server.mark_episode(server.read_dataset(), 1, True)
+        assert lines() == []
+        server.delete_episode(server.read_dataset(), 0)  # what is left gets new numbers, and shares a file
+        assert lines() == []
+
+
+def test_a_replay_finds_a_built_in_urdf_and_names_one_that_is_gone(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="needs viser (pip install 'robot-hal[viewer]')")
+    dataset = make_recording(tmp_path / "demo")
+    (common,) = (dataset.root / "episodes").glob("common-*.json")
+    text, urdf = common.read_text(), dataset.episodes[0].info["rig"]["resolved"]["robots"][0]["urdf"]
+    common.write_text(text.replace(urdf, "/elsewhere/robots/panda.urdf"))
+    assert "__VISER_EMBED_DATA__" in write_replay(Dataset(dataset.root).episodes[0])
+    common.write_text(text.replace(urdf, "/elsewhere/mine.urdf"))
+    with pytest.raises(HalError, match=r"/elsewhere/mine\.urdf"):
+        write_replay(Dataset(dataset.root).episodes[0])

@@ -110,7 +110,7 @@ def test_workspace_is_drawn_at_its_bounded_sides() -> None:
     from hal.drivers.viser.scene import workspace_lines
 
     box = workspace_lines(WorkspaceSpec((0.1, -0.2, 0.0), (0.6, 0.2, 0.5)))
-    assert box.shape == (24, 2, 3)  # each edge belongs to two sides
+    assert box.shape == (12, 2, 3)
     assert box.reshape(-1, 3).min(axis=0) == pytest.approx((0.1, -0.2, 0.0))
     assert box.reshape(-1, 3).max(axis=0) == pytest.approx((0.6, 0.2, 0.5))
     table = workspace_lines(WorkspaceSpec((-10.0, -10.0, 0.01), (10.0, 10.0, 10.0)))

@@ -51,7 +51,7 @@ def test_a_goal_is_a_unit_quaternion_and_has_a_number_of_its_own() -> None:
     assert drag.move(1, THERE, (0.0, 0.0, 0.9, 0.9), 11.0)
     second = drag.goal
     assert second.seq > first.seq
-    assert np.linalg.norm(second.orientation) == pytest.approx(1.0)
+    assert np.linalg.norm(second.pose.orientation) == pytest.approx(1.0)
     drag.clear()
     drag.grab(1)
     drag.move(1, THERE, LEVEL, 12.0)
