@@ -96,10 +96,10 @@ def open_to_change(dataset: str | Path | Dataset) -> Iterator[Dataset]:
     if not layout.info.exists():
         Dataset(root)  # raises what is wrong; the lock would make a folder
     with lock_dataset(layout):
-        recover_all(layout)
         if known is not None and known.has_changed():
             raise CommandError(f"{root} has changed since it was opened; nothing was done", code="dataset_changed")
-        yield known or Dataset(layout.root)
+        recover_all(layout)  # this adds episodes, or completes marks; the numbers stay
+        yield known if known is not None and not known.has_changed() else Dataset(layout.root)
 
 
 def _change_marks(

@@ -100,7 +100,8 @@ def merge(
             locks.enter_context(lock_dataset(layout, only_read=not (replaces and layout.root == target.root)))
             if layout.partials():
                 raise CommandError(
-                    f"{layout.root} has an unfinished episode or change; finish it first, with recover()",
+                    f"{layout.root} has an unfinished episode or change; finish with: hal review {layout.root} "
+                    "--repair",
                     code="unfinished_episodes",
                 )
         for part in parts:

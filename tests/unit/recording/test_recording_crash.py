@@ -56,6 +56,11 @@ def test_what_a_killed_writer_leaves_becomes_an_episode(out: Path) -> None:
     check_layout(out)
 
 
+def test_a_mark_of_an_open_dataset_finishes_what_a_killed_writer_left(out: Path) -> None:
+    mark_episodes(Dataset(out), {0: False})
+    assert [episode.success for episode in Dataset(out).episodes] == [False, None]
+
+
 @pytest.mark.parametrize("mark", [True, False])
 def test_the_mark_survives_a_killed_writer(tmp_path: Path, mark: bool) -> None:
     with mock_rig() as rig, Recorder(rig, tmp_path / "out") as recorder:
