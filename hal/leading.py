@@ -75,7 +75,7 @@ class HandTeleop(Teleop):
         if pad.pose:
             return self._follow(pad.pose, pad, dt)
         self._anchor = self._before = None
-        return self.step(pad, dt)
+        return super().command(pad, dt)
 
     def _follow(self, where: tuple[float, ...], pad: PadState, dt: float) -> tuple[Command, float | None]:
         """Return the command for a hand or a leader that is there, and the grip."""

@@ -506,7 +506,7 @@ class TeleopSession:
             specs = [(arm, arm.pad.driver.spec) for arm in self.arms]
             arm = next((arm for arm, spec in specs if spec.driver == page and not spec.hand), self.arms[0])
             teleop, several = arm.teleop, ("other_arm",) if len(arm.robots) > 1 else ()
-            console.explain(teleop.labels(actions=("home", *several, *self._actions)))
+            console.explain(teleop.labels(actions=("home", "jog", *several, *self._actions)))
             console.show_driving(
                 DrivingView(arm.robot.name, teleop.speed, self._speed_max, teleop.frame, self._settings)
             )

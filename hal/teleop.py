@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from . import registry
 from .arguments import number
-from .commands import Twist
+from .commands import JointVelocity, Twist
 from .config.mapping import AxisMapping, TeleopMapping, load_mapping
 from .errors import CommandError, ConnectionLost, MotionStopped, NotSupported, RobotFault, StaleStateError
 from .geometry import Pose, difference
-from .types import PadState
+from .types import JOINT_AXES, PadState
 
 if TYPE_CHECKING:
     from .commands import Command
@@ -98,7 +98,7 @@ class Teleop:
 
     def is_touched(self, pad: PadState) -> bool:
         """Return whether a control is held that moves the arm or its gripper."""
-        if any(self.mapping.twist(pad)):
+        if any(self.mapping.twist(pad)) or any(self._jog(pad)):
             return True
         gripper = self.mapping.gripper
         if gripper is None:
@@ -126,8 +126,19 @@ class Teleop:
         return Twist(linear, angular, frame=self.frame), self._grip(pad)
 
     def command(self, pad: PadState, dt: float) -> tuple[Command, float | None]:
-        """Return the command and the grip for a state of the pad, or of a leader; as :meth:`step` for a pad."""
-        return self.step(pad, dt)
+        """Return the command and the grip for a state of the pad, or of a leader.
+
+        As :meth:`step`, but while an axis of ``hal.types.JOINT_AXES`` is pushed, the command moves that joint alone, as
+        fast as the mapping turns the tool.
+        """
+        motion, grip = self.step(pad, dt)
+        jog = self._jog(pad)
+        return JointVelocity(jog) if any(jog) else motion, grip
+
+    def _jog(self, pad: PadState) -> list[float]:
+        """Return the speed at which each joint (n,) is to be jogged, rad/s."""
+        speed = self.speed * self.mapping.speeds()[1]
+        return [speed * pad.axes.get(f"joint_{k}", 0.0) for k in range(1, self.robot.n + 1)]
 
     def home_pressed(self, pad: PadState) -> bool:
         """Return whether the button that moves the arm home was pressed since the last call."""
@@ -191,8 +202,8 @@ class Teleop:
         """Return what the controls do, for a page that displays them.
 
         Args:
-            actions: Actions of the mapping that the program handles, ``home`` if it uses :meth:`home_pressed`, and
-                ``other_arm`` if it uses :meth:`other_arm_pressed`.
+            actions: Actions of the mapping that the program handles, ``home`` if it uses :meth:`home_pressed`,
+                ``other_arm`` if it uses :meth:`other_arm_pressed`, and ``jog`` if it uses :meth:`command`.
 
         Returns:
             A dict for JSON. Its ``controls`` map an axis to its meanings at both ends (-1 and 1, or released and
@@ -215,6 +226,9 @@ class Teleop:
         controls |= {button: [action] for action, button in mapping.actions.items() if action in actions}
         if mapping.other_arm is not None and "other_arm" in actions:
             controls[mapping.other_arm] = ["next arm"]
+        if "jog" in actions and mapping.speeds()[1] > 0.0:
+            joints = zip(JOINT_AXES, self.robot.joints, strict=False)
+            controls |= {axis: [f"jog {joint} -", f"jog {joint} +"] for axis, joint in joints}
         home = mapping.go_home if "home" in actions else None
         if home is not None:
             controls[home] = ["home"]
@@ -415,12 +429,13 @@ class ArmTeleop:
         self.load_mapping()
 
     def follow_gizmo(self, motion: Command, view: Viewer3D | None) -> Command:
-        """Return the velocity towards the gizmo of the 3D view if it was dragged; a stick, or a release, resets it."""
+        """Return the velocity towards the gizmo of the 3D view if it was dragged; a control, or a release, resets it."""
         name = self.robot.name
         goal = view.goal(name) if view is not None else None
-        if view is None or goal is None or not isinstance(motion, Twist):
+        if view is None or goal is None:
             return motion
-        if motion.linear.any() or motion.angular.any() or self.held_for or not self.deadman.held:
+        moved = not isinstance(motion, Twist) or motion.linear.any() or motion.angular.any()
+        if moved or self.held_for or not self.deadman.held:
             view.clear_goal(name)
             return motion
         linear, angular = self.teleop.mapping.speeds()

@@ -21,14 +21,20 @@ from .geometry import Pose
 Array = NDArray[np.float64]
 
 STICK_AXES = ("left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y")
-"""Axes of a gamepad with sticks, in the order in which the console's page sends them. Right and up are positive."""
+"""Axes of a gamepad with sticks. Right and up are positive."""
 
 CAP_AXES = ("push_x", "push_y", "push_z", "turn_x", "turn_y", "turn_z")
 """Axes of a pad with one cap that moves in all directions (a SpaceMouse): pushed forward, left and up, and
 rotated about these directions, right-handed. They match the axes of an arm's base frame for a user who stands behind
 it."""
 
-AXES = STICK_AXES + CAP_AXES
+JOINT_AXES = tuple(f"joint_{k}" for k in range(1, 9))
+"""Axes that jog one joint of the arm each, in the order of its joints."""
+
+PAGE_AXES = STICK_AXES + JOINT_AXES
+"""Axes of the console's page, in the order in which it sends them."""
+
+AXES = STICK_AXES + CAP_AXES + JOINT_AXES
 """All axes that a pad may have. Values are in -1..1, those of :data:`ONE_SIDED` in 0..1. A pad has some of them, and
 datasets find theirs by name."""
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
+from hal.types import BUTTONS, ONE_SIDED, PAGE_AXES
 from hal.views import ACTIONS, FRAMES, SETTINGS
 
 HANDS = ("any", "left", "right")
@@ -36,7 +36,7 @@ _LEFT = {
 }
 _MIN_SPEED = 0.01
 """Smallest share of the mapping's speeds that a page may set."""
-_RANGES = tuple((0.0 if axis in ONE_SIDED else -1.0, 1.0) for axis in STICK_AXES)
+_RANGES = tuple((0.0 if axis in ONE_SIDED else -1.0, 1.0) for axis in PAGE_AXES)
 _MASKS = 1 << len(BUTTONS)
 _HAND = ((-100.0, 100.0),) * 3 + ((-1.01, 1.01),) * 4 + ((0.0, 1.0),)
 """Ranges of a hand's pose (m, and a unit quaternion) and grip."""
@@ -56,7 +56,7 @@ class PadMessage(NamedTuple):
     since: float
     """Time since the page received it, in s."""
     axes: tuple[float, ...]
-    """In the order of ``hal.types.STICK_AXES``: sticks -1..1, triggers 0..1."""
+    """In the order of ``hal.types.PAGE_AXES``: sticks and joints -1..1, triggers 0..1."""
     buttons: int
     """Bit k: button k of ``hal.types.BUTTONS`` is pressed."""
     hands: Mapping[str, tuple[float, ...]] = MappingProxyType({})

@@ -18,7 +18,7 @@ from hal.pads.choice import play_tour
 from hal.pads.keyboard import keyboard_table
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
-from hal.types import AXES, BUTTONS, STICK_AXES
+from hal.types import AXES, BUTTONS, PAGE_AXES
 
 _RELEASED: Mapping[str, float] = MappingProxyType(dict.fromkeys(AXES, 0.0))
 _LOST_TIME = 0.05
@@ -47,11 +47,11 @@ def pad_reading(message: Mapping[str, Any], hand: str = "any", deadman: str = "l
     *pose, grip = map(float, message["hands"].get(hand, [0.0]))
     if hand == "any":
         mask = int(message["buttons"])
-        axes = dict(zip(STICK_AXES, map(float, message["axes"]), strict=True))
+        axes = dict(zip(PAGE_AXES, map(float, message["axes"]), strict=True))
         buttons = {name for bit, name in enumerate(BUTTONS) if mask >> bit & 1}
     else:
         buttons = {deadman} if pose else set()
-        axes = {name: float(name in buttons) for name in STICK_AXES}
+        axes = {name: float(name in buttons) for name in PAGE_AXES}
     axes["r2"] = max(axes["r2"], grip)
     if grip > _PRESSED:
         buttons.add("r2")

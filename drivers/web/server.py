@@ -28,7 +28,7 @@ from hal.host.ring import frame_rings
 from hal.keys import Credentials
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import CameraSpec, from_json
-from hal.types import BUTTONS, ONE_SIDED, STICK_AXES
+from hal.types import BUTTONS, ONE_SIDED, PAGE_AXES
 from hal.views import ACTIONS
 
 from .messages import MalformedMessage, StopRequest, encode, parse
@@ -252,8 +252,8 @@ def keys_module(table: Mapping[str, Any]) -> PageFile:
     """
     constants = {
         "KEYS": table,
-        "AXES": STICK_AXES,
-        "ONE_SIDED": [axis for axis in STICK_AXES if axis in ONE_SIDED],
+        "AXES": PAGE_AXES,
+        "ONE_SIDED": [axis for axis in PAGE_AXES if axis in ONE_SIDED],
         "BUTTONS": BUTTONS,
         "ACTIONS": ACTIONS,
         "PAD_SILENCE": PAD_SILENCE,

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hal.types import BUTTONS, PadState
+from hal.types import BUTTONS, PAGE_AXES, PadState
 from hal.views import ACTIONS
 
 from .kit import Bench, Browser, wait_for
@@ -107,7 +107,7 @@ def test_the_dead_man_and_what_moves_the_arm_are_over_at_once(page: Browser, tar
 
 
 def test_nor_is_a_key_that_pushes_an_axis(page: Browser) -> None:
-    pushed = [one["axes"][-1] for one in tap(page, "ArrowUp")]
+    pushed = [one["axes"][PAGE_AXES.index("dpad_y")] for one in tap(page, "ArrowUp")]
     assert pushed == [1, 0]
 
 

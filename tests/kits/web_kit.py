@@ -21,12 +21,12 @@ from hal.host.ring import frame_rings, frame_rings_size
 from hal.pads.keyboard import keyboard_table
 from hal.specs import CameraSpec, to_json
 from hal.testing import camera_spec
-from hal.types import STREAMS, Limited, RobotStatus, Trip
+from hal.types import PAGE_AXES, STREAMS, Limited, RobotStatus, Trip
 
 TOKEN = "a-token-of-the-test_0123456789"
 JOINTS = [("arm", 3)]
 GRIPPERS = ["arm.gripper"]
-REST = [0.0] * 8
+REST = [0.0] * len(PAGE_AXES)
 WAIT = 20.0
 """s after which something that never comes is missed."""
 HEADER = struct.Struct("<BBHIdf")

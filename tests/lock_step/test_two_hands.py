@@ -12,6 +12,7 @@ from hal.gamepad import Gamepad
 from hal.learning.replay import RecordedTrajectory, TrajectoryPlayer
 from hal.recording import Dataset, Recorder
 from hal.specs import PadSpec
+from hal.types import PAGE_AXES
 
 RIG = {
     "robots": {
@@ -41,7 +42,7 @@ class Page:
 
     def send(self, t: float, hands: dict[str, list[float]]) -> None:
         held = "any" in hands
-        axes = [0.0, 0.0, 0.0, 0.0, float(held), 0.0, 0.0, 0.0]
+        axes = [float(held and name == "l2") for name in PAGE_AXES]
         message = {"connected": True, "t": t, "t_alive": t, "axes": axes, "buttons": held << 6, "hands": hands}
         for queue in self.queues:
             queue.put(pad_reading(message, queue.hand, self.deadman))

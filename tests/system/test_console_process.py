@@ -56,7 +56,7 @@ async def test_too_many_messages_close_the_page_and_a_stop_among_them_counts(app
     async with Page(app) as page:
         await page.take()
         for _ in range(900):
-            await page.ws.send_json(page.pad([1.0] * 8))
+            await page.ws.send_json(page.pad([1.0] * 16))
         await page.say(type="stop")
         missing = [{"stop": "page 1"}, {"driver": None}]  # in either order
         told = await app.all_until(lambda message: message in missing and (missing.remove(message) or not missing))
@@ -104,12 +104,12 @@ async def test_messages_during_a_stall_of_the_server_move_nothing(app: App) -> N
         try:
             until = time.monotonic() + 0.8
             while time.monotonic() < until:
-                await page.ws.send_json(page.pad([1.0] * 8, 64))
+                await page.ws.send_json(page.pad([1.0] * 16, 64))
                 await asyncio.sleep(0.02)
         finally:
             os.kill(app.child.process.pid, signal.SIGCONT)
         assert not (await app.pad())["connected"]
-        await page.drive([0.125] * 8)
+        await page.drive([0.125] * 16)
         while True:
             pad = await app.pad()
             if pad["connected"]:
@@ -123,7 +123,7 @@ async def test_an_app_that_does_not_read_delays_no_page(app: App) -> None:
     async with Page(app) as page, Page(app) as watcher:
         await page.take()
         for k in range(200):
-            await page.drive([k / 200.0] * 8)
+            await page.drive([k / 200.0] * 16)
             if k == 150:
                 await watcher.say(type="stop")
             await asyncio.sleep(0.005)

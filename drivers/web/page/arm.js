@@ -8,15 +8,16 @@ const UNITS = { rad: [1, 3], deg: [180 / Math.PI, 1] };
 
 /** The bar of one joint: measured and target position between its limits; a bar is as long as the joint's range. */
 class JointBar {
-  /** @param {string} name @param {number} lower @param {number} upper @param {number[]} scale the ends of all bars
-   *  @param {() => void} clicked */
-  constructor(name, lower, upper, [first, last], clicked) {
+  /** @param {string} name @param {number} k @param {number} lower @param {number} upper
+   *  @param {number[]} scale the ends of all bars @param {() => void} clicked */
+  constructor(name, k, lower, upper, [first, last], clicked) {
     this.lower = lower;
     this.upper = upper;
     this.span = upper - lower || 1;
     this.element = make("li");
     const button = make("button");
     button.type = "button";
+    button.dataset.joint = String(k);
     button.addEventListener("click", clicked);
     this.measured = make("i", "measured");
     this.target = make("i", "target");
@@ -30,7 +31,14 @@ class JointBar {
     scale.append(track);
     button.append(make("span", "name", name), scale, this.value);
     this.name = name;
-    this.element.append(button);
+    this.element.append(button, ...[-1, 1].map((way) => {
+      const jog = make("button", "control", way < 0 ? "−" : "+");
+      jog.type = "button";
+      Object.assign(jog.dataset, { jog: `joint_${k + 1}`, way });
+      jog.title = `Press, while you hold to move: ${name} moves alone`;
+      jog.setAttribute("aria-label", `Jog ${name} ${way < 0 ? "minus" : "plus"}`);
+      return jog;
+    }));
     this.button = button;
   }
 
@@ -72,9 +80,8 @@ class Joints {
     const scale = [Math.min(...robot.lower), Math.max(...robot.upper)];
     this.rows = robot.joints.map((/** @type {string} */ name, /** @type {number} */ k) => {
       const [lower, upper, short] = [robot.lower[k], robot.upper[k], shortened(name, robot.joints)];
-      return new JointBar(short, lower, upper, scale, () => this.#choose(k));
+      return new JointBar(short, k, lower, upper, scale, () => this.#choose(k));
     });
-    this.rows.forEach((row, k) => (row.button.dataset.joint = String(k)));
     byId("joints").replaceChildren(...this.rows.map((row) => row.element));
     this.joint = null;
     this.#mark();

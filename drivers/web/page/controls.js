@@ -157,6 +157,7 @@ export class Controls {
       this.slider.forget,
       this.#wire(this.hold, enabled, (on) => pad.hold("page", on)),
       this.#wire(this.home, () => enabled() && pad.held, (on) => pad.goHome("page", on)),
+      this.#wireJoints(byId("joints")),
     ];
     /** @type {[Disc, number, number][]} */
     this.discs = [];
@@ -207,6 +208,24 @@ export class Controls {
     return this.#wire(element, this.enabled, press);
   }
 
+  /** Let one button at a time jog its joint; the list outlives its rows. @param {HTMLElement} joints */
+  #wireJoints(joints) {
+    let jogged = "";
+    return onPress(joints, {
+      down: (event) => {
+        const { jog, way } = /** @type {HTMLElement} */ (event.target).dataset;
+        if (!jog || jogged || !this.enabled()) return false;
+        this.source.axes[AXIS[(jogged = jog)]] = Number(way);
+        this.pad.update();
+      },
+      up: () => {
+        this.source.axes[AXIS[jogged]] = 0;
+        jogged = "";
+        this.pad.update();
+      },
+    });
+  }
+
   /** Label every control with what it does. @param {any} labels */
   explain({ deadman, home, controls }) {
     this.#explained ||= Object.keys(controls).length > 0;
@@ -215,6 +234,7 @@ export class Controls {
     const actions = Object.keys(controls).filter((name) => ACTIONS.includes(controls[name].join()));
     const moving = Object.keys(controls).filter((name) => !actions.includes(name));
     setData(document.documentElement, "explained", this.#explained ? "" : null);
+    setData(document.documentElement, "jogs", "joint_1" in controls ? "" : null);
     this.pad.explain(deadman, home, actions, moving);
     for (const [disc] of this.discs) {
       const [across, up] = DISCS[/** @type {keyof typeof DISCS} */ (disc.element.dataset.disc)];

@@ -106,7 +106,7 @@ export function onPress(element, { down, move, up }) {
   for (const type of /** @type {const} */ (["pointerup", "pointercancel", "lostpointercapture"])) {
     element.addEventListener(type, (event) => end(event.pointerId));
   }
-  const noMagnifier = (/** @type {TouchEvent} */ event) => event.cancelable && event.preventDefault();
+  const noMagnifier = (/** @type {any} */ event) => event.cancelable && event.target.closest(".control") && event.preventDefault();
   element.addEventListener("touchstart", noMagnifier, { passive: false });
 
   return () => {

@@ -21,6 +21,9 @@ function isActivation(event) {
   return event.key === "Enter" && active !== null && active.matches("button, summary, a");
 }
 
+/** Return the button that jogs a joint, if one was reached with Tab. @returns {HTMLElement | null} */
+const findJog = () => document.activeElement?.closest("[data-jog]") ?? null;
+
 export class Keyboard {
   /**
    * @param {import("./pad.js").Pad} pad
@@ -37,8 +40,8 @@ export class Keyboard {
     addEventListener("keyup", (event) => this.#released(event));
   }
 
-  /** Keys that were pressed while this page drove. @type {Set<string>} */
-  #down = new Set();
+  /** Keys that were pressed while this page drove -> the button that Enter presses. @type {Map<string, HTMLElement?>} */
+  #down = new Map();
   /** Keys whose press was used here, so that their repetition scrolls nothing. @type {Set<string>} */
   #ours = new Set();
 
@@ -66,10 +69,11 @@ export class Keyboard {
       if (this.#ours.has(key)) event.preventDefault();
       return;
     }
-    if (!this.enabled() || isTyping(event.target) || isActivation(event)) return;
+    const jog = event.key === "Enter" ? findJog() : null;
+    if (!this.enabled() || isTyping(event.target) || (!jog && isActivation(event))) return;
     event.preventDefault();
     this.#ours.add(key);
-    this.#down.add(key);
+    this.#down.set(key, jog);
     this.#apply();
   }
 
@@ -101,7 +105,10 @@ export class Keyboard {
       if (this.#down.has(key)) this.source.axes[AXIS[axis]] += way * reach;
     }
     for (const [key, button] of Object.entries(KEYS.buttons)) {
-      if (this.#down.has(key)) this.source.mask |= BIT[button];
+      if (this.#down.get(key) === null) this.source.mask |= BIT[button];
+    }
+    for (const button of this.#down.values()) {
+      if (button) this.source.axes[AXIS[String(button.dataset.jog)]] = reach * Number(button.dataset.way);
     }
     this.pad.hold("key", KEYS.hold.some(isDown));
     this.pad.goHome("key", KEYS.go_home.some(isDown));

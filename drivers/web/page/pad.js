@@ -1,7 +1,7 @@
 // One pad out of everything that may drive at the same time: fingers on the page, keys, a gamepad.
 //
-// The server makes keys.js: AXES and BUTTONS are those of hal/types.py, in the order in which they are sent. Sticks and
-// d-pad are -1..1 (right and up positive), those of ONE_SIDED are 0..1; bit k of a mask is button k.
+// The server makes keys.js: AXES and BUTTONS are those of hal/types.py, in the order in which they are sent. Sticks,
+// d-pad and joints are -1..1 (right and up positive), those of ONE_SIDED are 0..1; bit k of a mask is button k.
 
 import { AXES, BUTTONS, ONE_SIDED } from "./keys.js";
 

@@ -25,7 +25,7 @@ from hal.drivers.web.messages import (
 from hal.drivers.web.sockets import MAX_MALFORMED, MAX_MESSAGES, RateLimit
 from hal.views import ACTIONS
 
-AXES = [0.0, -1, 0.25, 1, 1, 0.0, -1.0, 1]
+AXES = [0.0, -1, 0.25, 1, 1, 0.0, -1.0, 1, 0, 0, -1, 0, 0, 0, 0, 1]
 PAD = {"type": "pad", "seen": 12.5, "since": 20.0, "axes": AXES, "buttons": 64, "hands": {}}
 HAND = [0.1, -2, 3, 0, 0.6, 0, 0.8, 1]
 
@@ -65,7 +65,7 @@ def test_valid_messages(message: dict[str, Any], record: object) -> None:
 
 
 WRONG_FIELDS: dict[str, list[Any]] = {
-    "axes": [[0.0] * 7, [], {}, [0, 0, 0, 0, -0.5, 0, 0, 0]],  # a trigger has no other side
+    "axes": [[0.0] * 8, [], {}, [0, 0, 0, 0, -0.5, *[0] * 11]],  # a trigger has no other side
     "buttons": [1 << 14, -1, 1.0, True, 10**400, ["l2"]],
     "seen": [-1.0, None, False, 10**400],
     "since": [-0.001, 1e10, "20"],
@@ -164,7 +164,7 @@ def test_a_pad_with_any_field_replaced_is_valid_or_malformed(value: object, key:
     except MalformedMessage:
         return
     if isinstance(record, PadMessage):
-        assert len(record.axes) == 8
+        assert len(record.axes) == 16
         assert all(-1.0 <= axis <= 1.0 for axis in record.axes)
         assert 0 <= record.buttons < 1 << 14
 

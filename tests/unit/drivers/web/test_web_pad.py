@@ -16,7 +16,7 @@ from hal.drivers.web.pad import PadQueue, WebPad, lost_reading, pad_reading
 from hal.errors import NotSupported
 from hal.gamepad import Gamepad
 from hal.specs import PadSpec
-from hal.types import BUTTONS, STICK_AXES
+from hal.types import BUTTONS, PAGE_AXES
 
 L2 = 1 << BUTTONS.index("l2")
 SOUTH = 1 << BUTTONS.index("south")
@@ -38,7 +38,7 @@ class Page:
         self.playing.append(on)
 
     def send(self, t: float, mask: int = 0, **axes: float) -> None:
-        values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in STICK_AXES]
+        values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in PAGE_AXES]
         message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask, "hands": {}}
         self.queue.put(pad_reading(message))
 
@@ -71,7 +71,7 @@ def test_axes_and_buttons_have_their_names(page: Page, pad: WebPad) -> None:
 def test_each_hand_holds_a_dead_man_of_its_own() -> None:
     """And neither that of the page, whose controls move neither of them."""
     hand = (0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0, 0.7)
-    message = {"connected": True, "t": 1.0, "t_alive": 1.0, "axes": [0.5] * 8, "buttons": SOUTH}
+    message = {"connected": True, "t": 1.0, "t_alive": 1.0, "axes": [0.5] * 16, "buttons": SOUTH}
     message["hands"] = {"left": hand}
     left, right, page = (pad_reading(message, side, "l1") for side in ("left", "right", "any"))
     assert (left.buttons, left.pose, left.axes["r2"], left.axes["left_x"]) == ({"l1", "r2"}, hand[:7], 0.7, 0.0)

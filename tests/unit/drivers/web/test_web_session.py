@@ -63,7 +63,7 @@ class Room:
         self.session.receive(page, json.dumps(message))
 
     def pad(self, page: WebPage, seen: float, since: float = 0.0, axes: list[float] | None = None) -> None:
-        axes = [0.0] * 8 if axes is None else axes
+        axes = [0.0] * 16 if axes is None else axes
         self.say(page, type="pad", seen=seen, since=since, axes=axes, buttons=0, hands={})
 
 
@@ -98,8 +98,8 @@ def test_only_the_pad_of_the_page_that_drives_counts(room: Room) -> None:
     room.pad(other, 100.0)
     assert (room.app.news(), inbox(other)) == ([], [])
     room.now = 100.02
-    room.pad(driver, 100.0, 20.0, [0.5, 0, 0, 0, 1, 0, 0, -1])
-    axes = (0.5, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0)
+    room.pad(driver, 100.0, 20.0, [0.5, 0, 0, 0, 1, 0, 0, -1, *[0] * 8])
+    axes = (0.5, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0, *[0.0] * 8)
     pad = {"connected": True, "t": 100.02, "t_alive": 100.02, "axes": axes, "buttons": 0, "hands": {}, "from": "page 1"}
     assert (room.app.news(), inbox(driver)) == ([{"pad": pad}], [{"type": "beat", "t": 100.02}])
 
@@ -107,8 +107,8 @@ def test_only_the_pad_of_the_page_that_drives_counts(room: Room) -> None:
 def test_a_late_message_is_no_pad_but_is_answered(room: Room) -> None:
     driver = room.driver()
     room.now = 100.3
-    room.pad(driver, 100.0, 20.0, [1.0] * 8)
-    room.pad(driver, 100.0, 40.0, [1.0] * 8)
+    room.pad(driver, 100.0, 20.0, [1.0] * 16)
+    room.pad(driver, 100.0, 40.0, [1.0] * 16)
     assert room.app.pads() == [(MESSAGES_LATE,)]
     assert inbox(driver) == [{"type": "beat", "t": 100.3}]
     room.pad(driver, 100.3)
@@ -159,7 +159,7 @@ def test_taking_control_loses_the_pad_in_between(room: Room) -> None:
     why = "page 2 took control"
     assert inbox(first) == [{"type": "lease", "driver": "page 2", "you": False, "t": 100.01, "why": why}]
     assert inbox(second)[0]["you"]
-    room.pad(first, 100.0, 10.0, [1.0] * 8)
+    room.pad(first, 100.0, 10.0, [1.0] * 16)
     assert room.app.news() == [], "what was on its way counts no more"
     assert inbox(first) == [], "and is not answered"
     room.pad(second, 100.01)
@@ -173,7 +173,7 @@ def test_messages_from_before_control_was_taken_back_do_not_count(room: Room) ->
     room.now = 100.02
     room.say(first, type="lease", take=True)
     room.app.news()
-    room.pad(first, 100.0, 20.0, [1.0] * 8)
+    room.pad(first, 100.0, 20.0, [1.0] * 16)
     assert room.app.news() == []
     room.pad(first, 100.02)
     assert room.app.pads() == ["page 1"]
@@ -196,7 +196,7 @@ def test_no_page_drives_after_the_driver_released_or_left(room: Room, how: str) 
     assert free == {"driver": None}
     (lease,) = inbox(other)
     assert (lease["driver"], lease["you"]) == (None, False)
-    room.pad(driver, 100.0, 0.0, [1.0] * 8)
+    room.pad(driver, 100.0, 0.0, [1.0] * 16)
     assert room.app.news() == []
 
 
@@ -233,7 +233,7 @@ def test_every_page_stops_and_only_the_driver_recovers_and_plays(room: Room) -> 
         {"type": "recover", "robot": "iiwa"},
         {"type": "watch", "cameras": {}},
         {"type": "drawn", "camera": "scene"},
-        {"type": "pad", "seen": 100.5, "since": 0, "axes": [0] * 8, "buttons": 0, "hands": {}},
+        {"type": "pad", "seen": 100.5, "since": 0, "axes": [0] * 16, "buttons": 0, "hands": {}},
     ],
 )
 def test_malformed_here(room: Room, message: dict[str, Any]) -> None:
@@ -327,7 +327,7 @@ def test_an_app_that_reads_again_gets_the_loss_and_the_newest_pad(room: Room) ->
     room.app.reads = False
     for k in range(1, 200):
         room.now = 100.0 + 0.02 * k
-        room.pad(driver, 100.0, 20.0 * k, [k / 200.0] * 8)
+        room.pad(driver, 100.0, 20.0 * k, [k / 200.0] * 16)
         if k == 50:
             room.say(driver, type="away", why="hidden")
         if k % 40 == 0:
