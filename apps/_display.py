@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import sys
 import time
@@ -128,7 +129,20 @@ def list_links(rig: Rig) -> str:
         ]
         if rig.console.tunnel:
             lines += ["  On another computer, run this first:", "", f"      {rig.console.tunnel}", ""]
+        else:
+            lines += [_draw_code(rig.console.link)]
     return "\n".join(lines)
+
+
+def _draw_code(link: str) -> str:
+    """Return the QR code of a link, for a phone; empty without the library for it."""
+    try:
+        import segno
+    except ImportError:
+        return ""
+    drawn = io.StringIO()
+    segno.make(link, error="l", micro=False).terminal(drawn, border=2, compact=True)
+    return drawn.getvalue()
 
 
 # The live line.

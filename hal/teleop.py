@@ -429,7 +429,7 @@ class ArmTeleop:
         self.load_mapping()
 
     def follow_gizmo(self, motion: Command, view: Viewer3D | None) -> Command:
-        """Return the velocity towards the gizmo of the 3D view if it was dragged; a control, or a release, resets it."""
+        """Return the velocity towards the gizmo of the 3D view if it was dragged; a control or a release resets it."""
         name = self.robot.name
         goal = view.goal(name) if view is not None else None
         if view is None or goal is None:

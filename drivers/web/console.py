@@ -208,8 +208,8 @@ class WebConsole(Console):
             self._start_recovery(str(message["recover"]), str(message["page"]))
         elif "demo" in message:
             self._play_tour(bool(message["demo"]), str(message["page"]))
-        elif "action" in message:
-            self._handle_action(str(message["action"]), str(message["page"]))
+        elif "action" in message and self._action_handler is not None:
+            self._action_handler(str(message["action"]))
         elif "setting" in message and self._setting_handler is not None:
             self._setting_handler(str(message["setting"]), message["value"])
 
@@ -248,16 +248,6 @@ class WebConsole(Console):
             return
         assert isinstance(pad.driver, WebPad)
         pad.driver.play(on)
-
-    def _handle_action(self, action: str, page: str) -> None:
-        if self._action_handler is None:
-            self._refuse(page, "this program records nothing")
-            return
-        try:
-            self._action_handler(action)
-        except Exception:
-            self._refuse(page, f"the program failed at {action!r}: see its own output")
-            raise  # printed by the channel
 
     def _refuse(self, page: str, why: str) -> None:
         self._channel.send("refused", page=page, why=name_buttons(why))
@@ -421,6 +411,7 @@ def _robot_message(robot: RobotSpec) -> dict[str, Any]:
         "joints": list(robot.joints),
         "lower": list(robot.limits.lower),
         "upper": list(robot.limits.upper),
+        "tcp_speed": robot.tcp_speed,
         "widths": [robot.gripper.width_min, robot.gripper.width_max] if robot.gripper is not None else None,
     }
 

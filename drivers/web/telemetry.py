@@ -9,7 +9,7 @@ from typing import Any
 from hal.commands import DeadmanRecord
 from hal.errors import Fault
 from hal.host.records import GripperMail, GroupMemory, RobotMail
-from hal.types import RobotState, RobotStatus, Trip
+from hal.types import RobotStatus, Trip
 
 _MAX_AGE = 0.1
 """A state older than this is not shown, in s; the same limit as that of ``robot.state()``."""
@@ -74,14 +74,12 @@ def _robot(mail: RobotMail, gripper: GripperMail | None, now: float) -> dict[str
         "q": _list(state.q),
         "q_set": _list(state.q_set),
         "dq": _list(state.dq),
-        "tcp": _tcp(state),
+        "tcp": _list(state.tcp.position) + _list(state.tcp.orientation),
+        "speed": round_number(math.hypot(*state.tcp_twist[:3])),
+        "force": None if state.wrench_ext is None else round_number(math.hypot(*state.wrench_ext[:3])),
         "gripper": _gripper(gripper, now),
         "deadman": _deadman(mail.get_deadman(), now),
     }
-
-
-def _tcp(state: RobotState) -> list[float | None]:
-    return _list(state.tcp.position) + _list(state.tcp.orientation)
 
 
 def _fault(fault: Fault | None) -> dict[str, str] | None:

@@ -96,7 +96,7 @@ def test_a_joint_is_jogged_alone_recorded_and_replayed(tmp_path: Path) -> None:
         return int(np.searchsorted(times, t))
 
     jogged = q[at(1.45)] - q[at(0.45)]
-    assert SPEED * 0.8 < jogged[3] < SPEED
+    assert 0.4 < jogged[3] < SPEED, "the servo keeps the tcp below 0.25 m/s"
     assert abs(np.delete(jogged, 3)).max() < 1e-6, "no other joint moves"
     assert abs(dq[at(0.45) : at(1.45)]).max() < SPEED + 1e-6
     forwards = q[at(1.95)] - q[at(1.55)]

@@ -66,13 +66,12 @@ class JointBar {
 
 /** The bars of all joints. */
 class Joints {
-  /** @param {(joint: number | null) => void} chosen called with the joint to plot, null for all */
-  constructor(chosen) {
-    this.chosen = chosen;
+  /** @param {Plot} plot shows a joint that is clicked */
+  constructor(plot) {
+    this.plot = plot;
     /** @type {JointBar[]} */
     this.rows = [];
-    /** @type {number | null} */
-    this.joint = null;
+    plot.chosen = () => this.rows.forEach((row, k) => setAttribute(row.button, "aria-pressed", String(k === plot.joint)));
   }
 
   /** Lay out the bars of an arm. @param {any} robot of hello */
@@ -80,27 +79,14 @@ class Joints {
     const scale = [Math.min(...robot.lower), Math.max(...robot.upper)];
     this.rows = robot.joints.map((/** @type {string} */ name, /** @type {number} */ k) => {
       const [lower, upper, short] = [robot.lower[k], robot.upper[k], shortened(name, robot.joints)];
-      return new JointBar(short, k, lower, upper, scale, () => this.#choose(k));
+      return new JointBar(short, k, lower, upper, scale, () => this.plot.choose(this.plot.joint === k ? null : k));
     });
     byId("joints").replaceChildren(...this.rows.map((row) => row.element));
-    this.joint = null;
-    this.#mark();
   }
 
   /** @param {any} robot of a state @param {string} unit */
   show(robot, unit) {
     this.rows.forEach((row, k) => row.show(robot.q[k], robot.q_set[k], unit));
-  }
-
-  /** @param {number} joint */
-  #choose(joint) {
-    this.joint = this.joint === joint ? null : joint;
-    this.#mark();
-    this.chosen(this.joint);
-  }
-
-  #mark() {
-    this.rows.forEach((row, k) => row.button.setAttribute("aria-pressed", String(k === this.joint)));
   }
 }
 
@@ -127,7 +113,7 @@ class Rate {
 export class ArmPanel {
   constructor() {
     this.plot = new Plot();
-    this.joints = new Joints((joint) => this.plot.choose(joint));
+    this.joints = new Joints(this.plot);
     /** @type {any[]} */
     this.robots = [];
     this.name = "";
@@ -137,12 +123,32 @@ export class ArmPanel {
     this.measured = new Map();
     /** Called with the name of an arm that was clicked. @type {(name: string) => void} */
     this.picked = () => {};
+    byId("copy").addEventListener("click", () => this.#copy());
     segments(byId("unit"), Object.keys(UNITS), (unit) => this.#measure(unit));
     this.#measure(remembered(UNIT_KEY) ?? "");
   }
 
-  /** Least and greatest width of the gripper, m. */
-  #widths = /** @type {[number, number] | null} */ (null);
+  /** The arm that is shown, of hello. @type {any} */
+  #robot = null;
+  /** Its newest state; null while it does not answer. @type {any} */
+  #state = null;
+
+  /** Copy joints and tcp as a dict that is Python, YAML and JSON alike. */
+  #copy() {
+    if (!this.#state) return;
+    const { q, tcp } = this.#state;
+    const [scale, digits] = UNITS[this.unit];
+    const joints = q.map((/** @type {number} */ value) => Number((scale * value).toFixed(digits + 2)));
+    const name = this.unit === "deg" ? "q_deg" : "q";
+    const text = JSON.stringify({ [name]: joints, tcp: { position: tcp.slice(0, 3), orientation: tcp.slice(3) } });
+    const field = make("textarea"); // navigator.clipboard needs https
+    field.value = text.replace(/[:,]/g, "$& ");
+    byId("copy").after(field);
+    field.select();
+    setText(byId("copy"), document.execCommand("copy") ? "copied" : "not copied");
+    field.remove();
+    setTimeout(() => setText(byId("copy"), "copy"), 1500);
+  }
 
   /** Show joints in a unit. @param {string} unit */
   #measure(unit) {
@@ -167,7 +173,8 @@ export class ArmPanel {
     const robot = this.robots.find((one) => one.name === name);
     if (!robot || name === this.name) return;
     this.name = name;
-    this.#widths = robot.widths;
+    this.#robot = robot;
+    this.#state = null;
     choose(byId("robots"), name);
     setText(byId("model"), robot.name);
     byId("model").title = `${robot.name}: ${robot.model}, ${robot.driver}, ${robot.real ? "a real arm" : "simulated"}`;
@@ -178,7 +185,12 @@ export class ArmPanel {
   /** Add a state to the plot and to the rates. @param {any} state */
   addState(state) {
     const robot = state.robots[this.name];
-    if (robot && !robot.lost) this.plot.add(state.t, robot.q, robot.q_set);
+    this.#state = robot && !robot.lost ? robot : null;
+    if (this.#state) {
+      const { q, q_set: set, speed, force } = robot;
+      const error = Math.max(...q.map((/** @type {number} */ value, /** @type {number} */ k) => Math.abs(value - set[k])));
+      this.plot.add(state.t, [...q, error, speed, force ?? NaN], [...set, 0, this.#robot.tcp_speed, 0]);
+    }
     for (const [name, host] of Object.entries(state.hosts ?? {})) {
       const rate = this.rates.get(name) ?? new Rate();
       this.rates.set(name, rate);
@@ -189,8 +201,8 @@ export class ArmPanel {
   /** Return how far the gripper is closed, 0..1, or null. @param {any} state */
   closed(state) {
     const gripper = state?.robots[this.name]?.gripper;
-    if (!gripper || !this.#widths || typeof gripper.width !== "number") return null;
-    const [least, most] = this.#widths;
+    if (!gripper || !this.#robot?.widths || typeof gripper.width !== "number") return null;
+    const [least, most] = this.#robot.widths;
     return Math.min(1, Math.max(0, (most - gripper.width) / (most - least)));
   }
 
@@ -205,6 +217,8 @@ export class ArmPanel {
       setText(byId("tcp"), `x ${signed(x, 3)}  y ${signed(y, 3)}  z ${signed(z, 3)} m`);
       const [roll, pitch, yaw] = angles(turn).map((angle) => signed(angle, 1));
       setText(byId("turned"), `${roll}  ${pitch}  ${yaw} °`);
+      setText(byId("tcp-speed"), `${signed(robot.speed, 3)} of ${this.#robot.tcp_speed} m/s`);
+      setText(byId("force"), robot.force === null ? "not measured" : `${signed(robot.force, 1)} N`);
       setText(byId("width"), gripperText(robot.gripper));
     }
     const known = there && Number.isFinite(silent);

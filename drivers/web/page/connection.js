@@ -120,15 +120,9 @@ export class Connection {
 
 /** Close code -> title and advice of the overlay. @type {Record<number, [string, string]>} */
 const ENDINGS = {
-  [REFUSED]: [
-    "this link is not valid",
-    "Use the newest link in the terminal.",
-  ],
+  [REFUSED]: ["this link is not valid", "Use the newest link in the terminal."],
   [TOO_MANY]: ["too many pages are open", "Close one of the others, then try again."],
-  [ENDED]: [
-    "the program has ended",
-    "Start it again and open the new link that it prints.",
-  ],
+  [ENDED]: ["the program has ended", "Start it again and open the new link that it prints."],
 };
 
 /** The cover of the page while there is no connection: nothing on it is live then. */

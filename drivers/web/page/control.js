@@ -18,8 +18,9 @@ export class Lease {
     /** @type {(t: number) => void} */
     this.granted = () => {};
     this.ended = () => {};
+    /** Called with the reason when this page has lost control, unless it released it. @type {(why: string) => void} */
+    this.taken = () => {};
     byId("lease").addEventListener("click", () => this.#request(!this.mine));
-    byId("lost-close").addEventListener("click", () => show(byId("lost"), false));
     document.addEventListener("visibilitychange", () => this.#takeOnce());
   }
 
@@ -40,8 +41,7 @@ export class Lease {
     this.mine = message.you;
     this.driver = message.driver;
     this.#known = true;
-    if (this.mine) show(byId("lost"), false);
-    else if (had) this.#lost(message.why);
+    if (had && !this.mine && !this.#released) this.taken(message.why || "this page is no longer in control");
     if (this.mine && !had) this.granted(message.t);
     if (!this.mine && had) this.ended();
     this.#released = false;
@@ -84,14 +84,6 @@ export class Lease {
   #request(take) {
     this.#released = !take;
     this.connection.send({ type: "lease", take });
-  }
-
-  /** @param {string} why */
-  #lost(why) {
-    if (this.#released) return;
-    const text = why || "This page is no longer in control";
-    setText(byId("lost-text"), `${text[0].toUpperCase()}${text.slice(1)}.`);
-    show(byId("lost"), true);
   }
 
   /** Show the state; also when another arm is driven. */

@@ -1,8 +1,11 @@
 // The controls on the page: discs, slider and buttons; what they press, what they are called, what they show.
 
 import { byId, make, onPress, setAttribute, setData, setText, show } from "./dom.js";
-import { ACTIONS, KEYS } from "./keys.js";
+import { ACTIONS, BUTTONS, KEYS } from "./keys.js";
 import { AXIS, BIT, DISCS } from "./pad.js";
+
+/** Buttons that are on the page only if they have a meaning. */
+const RARE = ["l2", "l3", "r3", "touchpad"];
 
 /** Dead zone per axis, as a share of the way to the rim. Sticks get theirs from the program. */
 const DEAD = 0.08;
@@ -164,7 +167,7 @@ export class Controls {
     for (const element of this.#all("[data-disc]")) forget.push(this.#wireDisc(element));
     /** @type {[HTMLElement, number][]} */
     this.buttons = [];
-    for (const element of this.#all("[data-button]")) forget.push(this.#wireButton(element));
+    for (const name of BUTTONS) if (name !== "r2") forget.push(this.#wireButton(name));
     pad.released.push(() => forget.forEach((one) => one()));
     pad.changed.push(() => this.#paintSoon());
     this.explain({ deadman: pad.deadman, home: null, controls: {} });
@@ -195,9 +198,23 @@ export class Controls {
     return disc.forget;
   }
 
-  /** @param {HTMLElement} element */
-  #wireButton(element) {
-    const name = String(element.dataset.button);
+  /** Wire a button; one that has no place of its own is made below the others. @param {string} name */
+  #wireButton(name) {
+    const [found] = this.#all(`[data-button="${name}"]`);
+    const element = found ?? make("button", "control");
+    if (!found) {
+      element.type = "button";
+      element.dataset.button = name;
+      this.#all(".buttons")[0].append(element);
+    }
+    const note = make("small");
+    note.append(make("span", "pad", name.length === 2 ? name.toUpperCase() : name), " ");
+    element.append(make("b"), note);
+    const keys = Object.keys(KEYS.buttons).filter((key) => KEYS.buttons[key] === name);
+    if (keys.length) {
+      note.append(make("kbd", "", KEYS.legend.find(([, control]) => control === name)[0].split(" / ")[0]));
+      setAttribute(element, "aria-keyshortcuts", keys.map((key) => key.replace(/^Key|^Digit/, "")).join(" "));
+    }
     const press = (/** @type {boolean} */ on) => {
       if (name in AXIS) this.source.axes[AXIS[name]] = on ? 1 : 0; // a trigger; its bit follows
       else if (on) this.source.mask |= BIT[name];
@@ -259,7 +276,7 @@ export class Controls {
     const text = found ? found[found.length - 1] : "";
     setText(/** @type {Element} */ (element.querySelector("b")), text);
     setAttribute(element, "aria-label", text ? `${text} (${name})` : `${name}: does nothing here`);
-    const useful = found !== null || (!this.#explained && !("rare" in element.dataset));
+    const useful = found !== null || (!this.#explained && !RARE.includes(name));
     show(element, useful && name !== deadman && name !== home);
   }
 

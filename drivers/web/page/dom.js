@@ -106,8 +106,9 @@ export function onPress(element, { down, move, up }) {
   for (const type of /** @type {const} */ (["pointerup", "pointercancel", "lostpointercapture"])) {
     element.addEventListener(type, (event) => end(event.pointerId));
   }
-  const noMagnifier = (/** @type {any} */ event) => event.cancelable && event.target.closest(".control") && event.preventDefault();
-  element.addEventListener("touchstart", noMagnifier, { passive: false });
+  element.addEventListener("touchstart", (/** @type {any} */ event) => { // no magnifier over a control
+    if (event.cancelable && event.target.closest(".control")) event.preventDefault();
+  }, { passive: false });
 
   return () => {
     if (!pointers.size) return;

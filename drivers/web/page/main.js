@@ -178,6 +178,7 @@ lease.granted = (t) => {
   heartbeat.granted(t);
 };
 lease.ended = () => pad.reset();
+lease.taken = (why) => status.notice(`${why}: press "Take control" to get it back`);
 
 presence.left = (why) => {
   if (lease.mine) heartbeat.leave(why);

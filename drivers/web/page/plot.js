@@ -1,6 +1,6 @@
-// The plot of target and measured joint positions over the last seconds: one joint large, or all below each other.
+// The plot of the last seconds: target and measured joint positions, all below each other, or one joint or MORE large.
 
-import { byId, setText } from "./dom.js";
+import { byId, choose, segments, setText } from "./dom.js";
 
 /** Return a joint's name without the beginning that all of them share. @param {string} name @param {string[]} all */
 export function shortened(name, all) {
@@ -18,6 +18,13 @@ export function signed(value, digits) {
   return (value < 0 && Number(text) !== 0 ? "−" : "\u2007") + text;
 }
 
+/** What else is plotted: name, heading, what its dashed line is, digits; the first one is in the unit of the joints. */
+const MORE = [
+  ["error", "largest following error of a joint", "zero", 4],
+  ["speed", "tcp speed, m/s", "limit", 2],
+  ["force", "force on the tool, N", "zero", 1],
+];
+
 const SPAN = 20; // s
 const CAPACITY = 512; // samples; 20 a second come
 const GAP = 0.3; // s between two samples above which no line joins them
@@ -30,8 +37,14 @@ export class Plot {
     this.context = this.canvas.getContext("2d");
     /** @type {string[]} */
     this.names = [];
-    /** @type {number | null} */
+    /** The only thing to plot: a joint, or one of MORE, which follow them; null: all joints. @type {number | null} */
     this.joint = null;
+    /** Called when that changes. */
+    this.chosen = () => {};
+    const more = MORE.map(([name]) => String(name));
+    segments(byId("plots"), ["joints", ...more], (name) => {
+      this.choose(name === "joints" ? null : this.names.length + more.indexOf(name));
+    });
     this.visible = true;
     /** Of the unit in which positions are shown: its share of a radian, and digits. */
     [this.scale, this.digits] = [1, 3];
@@ -53,8 +66,7 @@ export class Plot {
   /** Clear the plot for these joints. @param {string[]} names */
   open(names) {
     this.names = names.map((name) => shortened(name, names));
-    this.#q = names.map(() => new Float32Array(CAPACITY));
-    this.#set = names.map(() => new Float32Array(CAPACITY));
+    [this.#q, this.#set] = [0, 1].map(() => [...names, ...MORE].map(() => new Float32Array(CAPACITY)));
     this.#count = 0;
     this.choose(null);
   }
@@ -62,11 +74,15 @@ export class Plot {
   /** @param {number | null} joint null: all of them */
   choose(joint) {
     this.joint = joint;
-    setText(byId("plotted"), joint === null ? "all" : this.names[joint]);
+    const more = joint === null ? undefined : MORE[joint - this.names.length];
+    setText(byId("plotted"), String(more ? more[1] : joint === null ? "all joints" : this.names[joint]));
+    setText(byId("dashed"), String(more ? more[2] : "target"));
+    choose(byId("plots"), String(more ? more[0] : "joints"));
+    this.chosen();
     this.paint();
   }
 
-  /** @param {number} t s @param {number[]} q @param {number[]} set rad */
+  /** @param {number} t s @param {number[]} q @param {number[]} set of the joints, rad, and of MORE */
   add(t, q, set) {
     const last = (this.#count - 1) % CAPACITY;
     if (this.#count && t <= this.#times[last]) {
@@ -151,8 +167,10 @@ export class Plot {
   #scale(middle, half, left, y) {
     const { context } = this;
     context.textAlign = "right";
+    const more = Number(this.joint) - this.names.length;
+    const [scale, digits] = [more > 0 ? 1 : this.scale, more < 0 ? this.digits : Number(MORE[more][3])];
     for (const value of [middle - half, middle, middle + half]) {
-      context.fillText(signed(this.scale * value, this.digits), left - 5, y(value));
+      context.fillText(signed(scale * value, digits), left - 5, y(value));
     }
   }
 

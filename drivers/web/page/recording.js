@@ -1,6 +1,6 @@
 // The panel of a program that records demonstrations: its progress, and the buttons that steer it.
 
-import { byId, onTap, setAttribute, setData, setText, show } from "./dom.js";
+import { byId, make, onTap, setAttribute, setData, setText, show } from "./dom.js";
 import { KEYS } from "./keys.js";
 
 const OLD = 10; // s; a program that records sends views more often
@@ -8,10 +8,10 @@ const OLD = 10; // s; a program that records sends views more often
 /** Phase -> tone of its lamp. @type {Record<string, string>} */
 const TONES = { ready: "on", recording: "record" };
 
-/** Field of the panel -> its text. @type {Record<string, (view: any) => string>} */
+/** What is listed -> its text. @type {Record<string, (view: any) => string>} */
 const FACTS = {
   episode: ({ saved, wanted }) => (wanted ? `${Math.min(saved + 1, wanted)} of ${wanted}` : String(saved + 1)),
-  seconds: ({ seconds }) => `${seconds.toFixed(1)} s`,
+  length: ({ seconds }) => `${seconds.toFixed(1)} s`,
   rows: ({ frames }) => String(frames),
   dropped: ({ dropped }) => String(dropped),
   succeeded: ({ succeeded }) => String(succeeded),
@@ -37,6 +37,12 @@ export class Recording {
     /** @type {HTMLElement[]} */
     this.buttons = [...byId("recording").querySelectorAll("[data-action]")];
     for (const button of this.buttons) onTap(button, () => this.#request(button.dataset.action));
+    for (const name of Object.keys(FACTS)) {
+      const row = make("div");
+      row.append(make("dt", "", name === "free" ? "disk free" : name), make("dd"));
+      row.lastChild.id = `recording-${name}`;
+      byId("recording").lastElementChild.append(row);
+    }
   }
 
   /** s since the newest view. */
