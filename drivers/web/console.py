@@ -225,11 +225,7 @@ class WebConsole(Console):
         if not self._recovering.acquire(blocking=False):
             self._refuse(page, "a robot is already being recovered")
             return
-        try:
-            threading.Thread(target=self._recover, args=(robot, page), name="hal-console-recover", daemon=True).start()
-        except RuntimeError:
-            self._recovering.release()
-            raise
+        threading.Thread(target=self._recover, args=(robot, page), name="hal-console-recover", daemon=True).start()
 
     def _recover(self, robot: str, page: str) -> None:
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hal.commands import DeadmanRecord
@@ -107,5 +107,4 @@ def _deadman(record: DeadmanRecord | None, now: float) -> dict[str, Any] | None:
 
 
 def _list(values: Any) -> list[float | None]:
-    numbers: Iterable[float] = values.tolist()
-    return [round_number(value) for value in numbers]
+    return [round_number(value) for value in values.tolist()]

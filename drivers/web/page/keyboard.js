@@ -21,9 +21,6 @@ function isActivation(event) {
   return event.key === "Enter" && active !== null && active.matches("button, summary, a");
 }
 
-/** Return the button that jogs a joint, if one was reached with Tab. @returns {HTMLElement | null} */
-const findJog = () => document.activeElement?.closest("[data-jog]") ?? null;
-
 export class Keyboard {
   /**
    * @param {import("./pad.js").Pad} pad
@@ -40,7 +37,7 @@ export class Keyboard {
     addEventListener("keyup", (event) => this.#released(event));
   }
 
-  /** Keys that were pressed while this page drove -> the button that Enter presses. @type {Map<string, HTMLElement?>} */
+  /** Keys that were pressed while this page drove -> the joint's button that Enter presses. @type {Map<string, any>} */
   #down = new Map();
   /** Keys whose press was used here, so that their repetition scrolls nothing. @type {Set<string>} */
   #ours = new Set();
@@ -69,7 +66,7 @@ export class Keyboard {
       if (this.#ours.has(key)) event.preventDefault();
       return;
     }
-    const jog = event.key === "Enter" ? findJog() : null;
+    const jog = event.key === "Enter" ? (document.activeElement?.closest("[data-jog]") ?? null) : null;
     if (!this.enabled() || isTyping(event.target) || (!jog && isActivation(event))) return;
     event.preventDefault();
     this.#ours.add(key);
@@ -108,7 +105,7 @@ export class Keyboard {
       if (this.#down.get(key) === null) this.source.mask |= BIT[button];
     }
     for (const button of this.#down.values()) {
-      if (button) this.source.axes[AXIS[String(button.dataset.jog)]] = reach * Number(button.dataset.way);
+      if (button) this.source.axes[AXIS[button.dataset.jog]] = reach * button.dataset.way;
     }
     this.pad.hold("key", KEYS.hold.some(isDown));
     this.pad.goHome("key", KEYS.go_home.some(isDown));
