@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import time
 
 import pytest
+
+from hal import Pose
 
 from .kit import Bench, Browser, wait_for
 from .moves import BRIEF, undisturbed
@@ -77,6 +80,34 @@ def test_keys_and_the_button_do_the_same(bench: Bench, page: Browser) -> None:
     page.key("ArrowUp", "ArrowUp", False)
     page.mouse("mouseReleased", button["x"], button["y"])
     wait_for(lambda: not held(bench), "the release")
+
+
+def test_a_joint_is_jogged_alone_by_the_mouse_and_by_enter(bench: Bench, page: Browser) -> None:
+    def jog() -> None:
+        at = page.place('[data-jog="joint_4"][data-way="-1"]')
+        page.hold()
+        page.mouse("mousePressed", at["x"], at["y"])
+        wait_for(lambda: bench.servo.dq_set[3] < -0.1, "the joint", BRIEF)
+        assert max(abs(speed) for k, speed in enumerate(bench.servo.dq_set) if k != 3) < 1e-3
+        page.mouse("mouseReleased", at["x"], at["y"])
+        wait_for(bench.rests, "the arm to rest", BRIEF)
+        page.run("document.querySelector('[data-jog=joint_4][data-way=\"1\"]').focus()")
+        page.key("Enter", "Enter", True)
+        wait_for(lambda: bench.servo.dq_set[3] > 0.1, "the way back", BRIEF)
+        page.key("Enter", "Enter", False)
+        wait_for(bench.rests, "the arm to rest", BRIEF)
+        page.let_go()
+
+    undisturbed(bench, page, jog)
+
+
+def test_joints_and_tcp_are_copied(bench: Bench, page: Browser) -> None:
+    page.run("addEventListener('copy', () => (window.copied = document.activeElement.value))")
+    page.click("#copy")
+    wait_for(lambda: page.text("#copy") == "copied", "the page to say so")
+    copied, state = json.loads(page.run("return window.copied")), bench.arm.state(max_age=2.0)
+    assert copied["q"] == pytest.approx(state.q.tolist(), abs=1e-3)
+    assert Pose(**copied["tcp"]).distance(state.tcp)[0] < 1e-3
 
 
 def test_the_sliders_place_is_the_grip(bench: Bench, page: Browser) -> None:
