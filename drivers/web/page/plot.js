@@ -147,7 +147,7 @@ export class Plot {
       high = Math.max(high, q[place], set[place]);
     }
     const middle = (low + high) / 2;
-    const half = Math.max(SMALLEST, high - low) / 2;
+    const half = Math.max(joint < this.names.length ? SMALLEST : SMALLEST / 10, high - low) / 2;
     const pad = alone ? 8 : 3;
     const y = (/** @type {number} */ value) => top + height / 2 - ((value - middle) / half) * (height / 2 - pad);
     context.fillStyle = context.strokeStyle = this.#colours.quiet;
