@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from hal.recording.dataset import Dataset, Episode
-    from hal.recording.review import ColumnSpread, DatasetSummary
+    from hal.recording.review import DatasetSummary
 
 LEAVE_OUT = (
     "restore the files of a damaged episode from a copy, or leave it out with hal export --episodes; "
@@ -218,15 +218,6 @@ def _table(found: DatasetSummary) -> Iterator[str]:
     yield from (f"cannot be read: {line}" for line in found.broken)
     if found.broken:
         yield LEAVE_OUT
-    if not found.episodes:
-        return
-    width = max(len(each.name) for each in found.state)
-    yield ""
-    heads = " ".join(f"{head:>8}" for head in ("min", "max", "mean", "std"))
-    yield f"{'':{width}}  {'measured: observation.state':39}{'commanded: action'}"
-    yield f"{'rad, gripper m':{width}}  {heads}    {heads}"
-    for state, action in zip(found.state, found.action, strict=True):
-        yield f"{state.name:{width}}  {_numbers(state)}    {_numbers(action)}"
     if not found.timing:
         return
     yield ""
@@ -235,10 +226,6 @@ def _table(found: DatasetSummary) -> Iterator[str]:
     for each in found.timing:
         values = (each.period, each.jitter, each.longest, each.age, each.oldest)
         yield f"{each.source:{width}}  {' '.join(f'{value:8.2f}' for value in values)}  {each.repeated:8d}"
-
-
-def _numbers(spread: ColumnSpread) -> str:
-    return " ".join(f"{value:8.4f}" for value in (spread.min, spread.max, spread.mean, spread.std))
 
 
 def _size(count: float) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from html import escape
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from ..errors import DatasetError
 from ..types import Limited, RobotStatus, Trip
 from .dataset import Dataset, Episode
 from .exporters.content import ArmColumns, EpisodeContent, PictureStream
-from .layout import ACTION, SETPOINT, STATE, count_bytes, make_finite
+from .layout import SETPOINT, STATE, count_bytes, make_finite
 from .metadata import simulated_pace
 
 # Drawing.
@@ -96,17 +96,6 @@ _IDLE = 0.02
 
 
 @dataclass(frozen=True)
-class ColumnSpread:
-    """Statistics of one number of a column over all rows: rad, or m of a gripper's width."""
-
-    name: str
-    min: float
-    max: float
-    mean: float
-    std: float
-
-
-@dataclass(frozen=True)
 class SourceTiming:
     """Regularity of the true times of a source, ms."""
 
@@ -159,8 +148,6 @@ class DatasetSummary:
     unmarked: int
     dropped: int
     bytes: int
-    state: list[ColumnSpread]
-    action: list[ColumnSpread]
     timing: list[SourceTiming]
     broken: list[str] = field(default_factory=list)
     """Errors of episodes that cannot be read."""
@@ -170,21 +157,14 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
     """Read every row of these episodes, or of all, and return their statistics. Pictures are counted, not decoded."""
     lines: list[EpisodeSummary] = []
     broken: list[str] = []
-    states: list[NDArray[Any]] = []
-    actions: list[NDArray[Any]] = []
-    names: list[str] = []
     times: dict[str, _Times] = {}
     for episode in dataset.episodes if episodes is None else episodes:
         try:
-            line, columns, stamps = measure_episode(episode), episode.columns, episode.stamps
-            parts = columns[STATE], columns[ACTION]
+            line, stamps = measure_episode(episode), episode.stamps
         except DatasetError as error:
             broken.append(str(error))
             continue
         lines.append(line)
-        names = episode.names(STATE)
-        states.append(parts[0])
-        actions.append(parts[1])
         for source, stamp in stamps.items():
             if source.startswith(_WATCHED):
                 times.setdefault(source, _Times()).add(stamp, stamps["grid"])
@@ -200,8 +180,6 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
         unmarked=sum(line.success is None for line in lines),
         dropped=sum(line.dropped for line in lines),
         bytes=count_bytes(dataset.root),
-        state=_spreads(names, states),
-        action=_spreads(names, actions),
         timing=[found.timing(source) for source, found in times.items()],
         broken=broken,
     )
@@ -215,20 +193,16 @@ def summary_as_json(found: DatasetSummary) -> str:
 def measure_episode(episode: Episode) -> EpisodeSummary:
     """Read every row of an episode, and count its pictures. Raises DatasetError."""
     episode.check_pictures()
-    status, names = episode.columns["rig.status"], episode.names("rig.status")
-    trips = 0
-    for k, name in enumerate(names):
-        if name.split(".")[-1] == "trip":
-            tripped = status[:, k] != 0
-            trips += int(tripped[0]) + int(np.sum(tripped[1:] & ~tripped[:-1]))
-    jerk, idle = _measure_motion(episode)
+    content = EpisodeContent(episode)
+    tripped = np.column_stack([_trips(content, arm) != 0 for arm in content.arms])
+    jerk, idle = _measure_motion(content)
     return EpisodeSummary(
         number=episode.number,
         rows=episode.length,
         seconds=float(np.ptp(episode.stamps["grid"])) + 1.0 / episode.fps,
         success=episode.success,
         dropped=int(episode.info.get("dropped") or 0),
-        trips=trips,
+        trips=int(tripped[0].sum() + np.sum(tripped[1:] & ~tripped[:-1])),
         task=episode.task,
         trouble=str(episode.info.get("trouble") or ("recovered" if episode.info.get("recovered") else "")),
         pace=simulated_pace(episode.info),
@@ -237,26 +211,14 @@ def measure_episode(episode: Episode) -> EpisodeSummary:
     )
 
 
-def _measure_motion(episode: Episode) -> tuple[float, float]:
+def _measure_motion(content: EpisodeContent) -> tuple[float, float]:
     """Return the jerk and the idle share of an episode, see :class:`EpisodeSummary`."""
-    content = EpisodeContent(episode)
+    fps = content.episode.fps
     joints = np.concatenate([content.of(arm, SETPOINT) for arm in content.arms], axis=1).astype(np.float64)
-    jerks = np.diff(joints, 3, axis=0) * episode.fps**3
-    fastest = np.abs(np.diff(joints, axis=0)).max(axis=1, initial=0.0) * episode.fps
+    jerks = np.diff(joints, 3, axis=0) * fps**3
+    fastest = np.abs(np.diff(joints, axis=0)).max(axis=1, initial=0.0) * fps
     jerk = float(np.sqrt(np.mean(jerks**2))) if jerks.size else math.nan
     return jerk, float(np.mean(fastest <= _IDLE)) if fastest.size else 1.0
-
-
-def _spreads(names: list[str], parts: Sequence[NDArray[Any]]) -> list[ColumnSpread]:
-    """Return the statistics of columns in parts, without unknown values (NaN)."""
-    table = np.concatenate(parts, dtype=np.float64) if parts else np.zeros((0, 0))
-    return [ColumnSpread(name, *_of(table[:, k])) for k, name in enumerate(names)]
-
-
-def _of(values: NDArray[np.float64]) -> Iterator[float]:
-    known = values[np.isfinite(values)]
-    for measure in (np.min, np.max, np.mean, np.std):
-        yield float(measure(known)) if known.size else math.nan
 
 
 class _Times:
@@ -276,9 +238,16 @@ class _Times:
 
     def timing(self, source: str) -> SourceTiming:
         periods, ages = np.concatenate(self._periods) * 1e3, np.concatenate(self._ages) * 1e3
-        _, longest, period, jitter = _of(periods)
-        _, oldest, age, _ = _of(ages)
+        longest, period, jitter = _measure(periods)
+        oldest, age, _ = _measure(ages)
         return SourceTiming(source, period, jitter, longest, age, oldest, self._repeated)
+
+
+def _measure(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return the greatest value, the mean and the standard deviation; NaN without values."""
+    if not values.size:
+        return math.nan, math.nan, math.nan
+    return float(values.max()), float(values.mean()), float(values.std())
 
 
 _WIDTH, _MARGIN = 1600, 40
