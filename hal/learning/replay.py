@@ -15,7 +15,8 @@ from ..control import Control
 from ..errors import CommandError, DatasetError, RobotFault
 from ..geometry import Pose
 from ..randomization import DISTRACTORS
-from ..recording.layout import GRIP_FORCE
+from ..recording.exporters.content import ArmColumns, EpisodeContent
+from ..recording.layout import GRIP_FORCE, SETPOINT, STATE
 from ..types import GripperOutcome, Limited, RobotStatus
 
 if TYPE_CHECKING:
@@ -45,7 +46,6 @@ _SAME_TCP = 0.01
 """Distance between the recorded tcp and the arm's own from which on the tool is another one, m."""
 _OUTSIDE = 1e-3
 """Distance by which the tcp may leave the workspace, m."""
-_OBJECT = "rig.object."
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,48 +81,36 @@ class RecordedTrajectory:
             CommandError: The episode has no such arm (code ``no_such_arm``).
             DatasetError: The episode lacks the columns of an arm.
         """
-        places, names = episode.names("observation.tcp"), episode.names("rig.setpoint")
-        several = "x" not in places  # then the arm's name leads every other name
-        lead = f"{robot.name}." if several else ""
-        if f"{lead}x" not in places:
-            arms = dict.fromkeys(name.partition(".")[0] for name in places)
+        content = EpisodeContent(episode)
+        arms = {arm.name: arm for arm in content.arms}
+        if len(arms) > 1 and robot.name not in arms:
             raise CommandError(
                 f"the episode has no arm {robot.name!r}; it has: {', '.join(arms)}; open the rig that it was "
                 "recorded with (--config)",
                 code="no_such_arm",
             )
-        own = [k for k, name in enumerate(names) if name.startswith(lead)]
-        labels = [names[k].removeprefix(lead) for k in own]
-        has_gripper = "gripper" in labels
-        joints = labels[:-1] if has_gripper else labels
-        n, first = len(joints), places.index(f"{lead}x")
-
-        clocks = [key for key in episode.stamps if key.startswith("robot.")]
-        if not clocks or episode.names("observation.state") != names:
+        arm = arms.get(robot.name) or next(iter(arms.values()), ArmColumns("", ""))
+        if f"robot.{arm.name}" not in episode.stamps or episode.names(STATE) != episode.names(SETPOINT):
             raise DatasetError("does not have the columns of an arm", file="meta/info.json")
-        key = f"robot.{robot.name}" if several else clocks[0]
-        stamps = episode.stamps[key]
+        stamps = episode.stamps[f"robot.{arm.name}"]
         t = stamps - stamps[0]
         later = np.append(True, np.diff(np.maximum.accumulate(t)) > 0.0)
 
-        def rows(key: str, which: Any) -> Array:
-            values: Array = np.asarray(episode.columns[key], float).reshape(len(t), -1)[later][:, which]
-            return values
+        def select(values: NDArray[Any]) -> Array:
+            return np.asarray(values, float)[later]
 
-        setpoint = rows("rig.setpoint", own)
-        forces = np.full(len(setpoint), np.nan)
-        if has_gripper and GRIP_FORCE in episode.columns:
-            forces = rows(GRIP_FORCE, episode.names(GRIP_FORCE).index(f"{lead}gripper"))
+        width, target = content.width(arm), content.width(arm, SETPOINT)
+        force = content.width(arm, GRIP_FORCE) if content.has(GRIP_FORCE) else np.full(len(t), np.nan)
         return cls(
-            joints=tuple(joints),
-            model=_model(episode.info, key.removeprefix("robot.")),
+            joints=tuple(content.joints(arm)),
+            model=_model(episode.info, arm.name),
             t=t[later],
-            q_set=setpoint[:, :n],
-            q=rows("observation.state", own)[:, :n],
-            width=rows("observation.state", own)[:, n] if has_gripper else None,
-            tcp=rows("observation.tcp", slice(first, first + 3)),
-            grip=np.stack([setpoint[:, n], forces], axis=1) if has_gripper else None,
-            objects=_distractors(episode.info) | _objects(episode.columns),
+            q_set=select(content.of(arm, SETPOINT)),
+            q=select(content.of(arm, STATE)),
+            width=None if width is None else select(width),
+            tcp=select(content.of(arm, "observation.tcp"))[:, :3],
+            grip=None if target is None else select(np.column_stack([target, force])),
+            objects=_distractors(episode.info) | _objects(content),
             randomization=episode.info.get("randomization"),
         )
 
@@ -283,8 +271,8 @@ def _distractors(info: Mapping[str, Any]) -> dict[str, Pose]:
     return {name: Pose(start[name][:3], start[name][3:]) for name in names if name in start}
 
 
-def _objects(columns: Mapping[str, NDArray[Any]]) -> dict[str, Pose]:
-    first = {key.removeprefix(_OBJECT): rows[0] for key, rows in columns.items() if key.startswith(_OBJECT)}
+def _objects(content: EpisodeContent) -> dict[str, Pose]:
+    first = {name: poses[0] for name, poses in content.objects.items()}
     return {name: Pose(row[:3], row[3:]) for name, row in first.items() if np.isfinite(row).all()}
 
 

@@ -66,8 +66,8 @@ class ArmColumns(NamedTuple):
     """Prefix of each name; empty if there is only one arm."""
 
     def owns(self, name: str) -> bool:
-        """Return whether this number of a shared column is the arm's."""
-        return name.startswith(self.lead)
+        """Return whether this number of a shared column is the arm's, and not its gripper's."""
+        return name.startswith(self.lead) and name != self.lead + _GRIPPER
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,7 @@ class EpisodeContent:
 
     def of(self, arm: ArmColumns, key: str) -> NDArray[Any]:
         """Return the arm's part (rows, n) of a column, without its gripper."""
-        names = self.episode.names(key)
-        wanted = [k for k, name in enumerate(names) if arm.owns(name) and name != arm.lead + _GRIPPER]
+        wanted = [k for k, name in enumerate(self.episode.names(key)) if arm.owns(name)]
         found: NDArray[Any] = self._table(key)[:, wanted]
         return found
 
@@ -137,11 +136,7 @@ class EpisodeContent:
 
     def joints(self, arm: ArmColumns) -> list[str]:
         """Return the names of the arm's joints."""
-        return [name.removeprefix(arm.lead) for name in self.episode.names(STATE) if self._is_joint(arm, name)]
-
-    @staticmethod
-    def _is_joint(arm: ArmColumns, name: str) -> bool:
-        return arm.owns(name) and name != arm.lead + _GRIPPER
+        return [name.removeprefix(arm.lead) for name in self.episode.names(STATE) if arm.owns(name)]
 
     def width(self, arm: ArmColumns, key: str = STATE) -> NDArray[Any] | None:
         """Return the width (rows,) of the arm's gripper, m; None without one."""

@@ -27,6 +27,11 @@ class Recorded:
     stamps: dict[str, Any] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
     joints: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.length = len(self.stamps["robot.panda"])
+        self.columns |= {f"rig.time.{name}": times for name, times in self.stamps.items()}
 
     def names(self, key: str) -> list[str]:
         other = {"observation.tcp": ["x", "y", "z", "qx", "qy", "qz", "qw"], "rig.setpoint_force": ["gripper"]}
