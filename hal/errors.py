@@ -23,6 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 __all__ = [
     "CollisionError",
@@ -196,6 +198,17 @@ class DriverMissing(HalError, ImportError):
         super().__init__(*args, code=code)
         self.name = name
         """Import name of the library, as for any ImportError; None if there is no single one."""
+
+
+def import_library(name: str, why: str, install: str) -> Any:
+    """Return the module of a library that is installed on request, as ``robot-hal[export]``.
+
+    Raises DriverMissing, with the command that installs it, if it cannot be imported; ``why`` is what needs it.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise DriverMissing(f"{why} needs {name} ({error}): pip install '{install}'", name=name) from error
 
 
 class DeviceNotFound(HalError, LookupError):

@@ -7,7 +7,6 @@ A board is read from a file (:func:`load_board`), printed to scale (:func:`print
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from pydantic import Field, model_validator
 from ..config.data_files import data_folder, is_path, user_path
 from ..config.files import Problems, read_yaml, validate
 from ..config.schema import Pixels, Size, Strict, ValueProblem
-from ..errors import CommandError, DriverMissing
+from ..errors import CommandError, DriverMissing, import_library
 
 BUILT_IN = "charuco_board"
 """The board that comes with the package: on a page of A4, and as an object of the simulated world."""
@@ -37,16 +36,11 @@ _RULER = 100
 
 def opencv() -> Any:
     """Return the module ``cv2``, 4.8 or later; DriverMissing, with the command that installs it, if there is none."""
-    install = "pip install 'robot-hal[calibration]'"
-    try:
-        cv2 = import_module("cv2")
-    except ImportError as error:
-        raise DriverMissing(
-            f"the board is detected with OpenCV, which cannot be imported: {error}; {install}", name="cv2"
-        ) from error
+    cv2 = import_library("cv2", "detecting the board", install := "robot-hal[calibration]")
     if not hasattr(getattr(cv2, "aruco", None), "CharucoDetector"):
         version = getattr(cv2, "__version__", "?")
-        raise DriverMissing(f"OpenCV {version} has no CharucoDetector (added in 4.7); {install}", name="cv2")
+        text = f"OpenCV {version} has no CharucoDetector (added in 4.7): pip install '{install}'"
+        raise DriverMissing(text, name="cv2")
     return cv2
 
 

@@ -11,7 +11,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
-from ..errors import CommandError, ConnectionLost, DriverMissing
+from ..errors import CommandError, ConnectionLost, import_library
 from ..host.process import pack_error, unpack_error
 from .episode_worker import EpisodeResult, EpisodeWorker
 from .generate import LONGEST, WorkerHandle
@@ -43,11 +43,7 @@ class RayCluster:
         self, address: str, workers: int, *, gpus: float = 0.0, runtime_env: Mapping[str, Any] | None = None
     ) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when Ray is imported
-        try:
-            import ray
-        except ImportError as error:
-            raise DriverMissing("ray is not installed: pip install 'robot-hal[ray]'", name="ray") from error
-        self._ray: Any = ray
+        self._ray = ray = import_library("ray", "--ray", "robot-hal[ray]")
         self._gpus = gpus
         own: dict[str, Any] = {"runtime_env": dict(runtime_env)} if runtime_env else {}
         self._folder: tempfile.TemporaryDirectory[str] | None = None

@@ -17,11 +17,12 @@ import traceback
 from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
+from importlib import import_module
 from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import DriverMissing, HalError, PolicyError
+from ..errors import HalError, PolicyError, import_library
 from ..keys import Credentials, find_credentials
 
 T = TypeVar("T")
@@ -56,13 +57,7 @@ def unpack(data: bytes) -> Any:
 
 
 def _msgpack() -> Any:
-    try:
-        import msgpack  # type: ignore[import-untyped]
-    except ImportError as error:
-        raise DriverMissing(
-            "a policy on a server needs msgpack: pip install 'robot-hal[policy]'", name="msgpack"
-        ) from error
-    return msgpack
+    return import_library("msgpack", "a policy on a server", "robot-hal[policy]")
 
 
 def _encode(value: Any) -> Any:
@@ -407,12 +402,9 @@ class PolicyServer:
 
 
 def _aiohttp() -> Any:
-    try:
-        import aiohttp
-        import aiohttp.web
-    except ImportError as error:
-        raise DriverMissing("a policy on a server needs aiohttp: pip install aiohttp", name="aiohttp") from error
-    return aiohttp
+    found = import_library("aiohttp", "a policy on a server", "aiohttp")
+    import_module("aiohttp.web")
+    return found
 
 
 def _find_tls_error(error: BaseException | None) -> ssl.SSLError | None:

@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..errors import CommandError, ConnectionLost, DriverMissing
+from ..errors import CommandError, ConnectionLost, DriverMissing, import_library
 from ..recording.layout import GROUP, file_version
 
 _RECIPE = "recipe.json"
@@ -48,12 +48,9 @@ def _open_address(address: str) -> tuple[Any, str]:
         DriverMissing: fsspec, or its package for this kind of address, is not installed.
         CommandError: The address is wrong (code ``bad_address``).
     """
+    fsspec = import_library("fsspec", address, "robot-hal[ray]")
     try:
-        from fsspec.core import url_to_fs
-    except ImportError as error:
-        raise DriverMissing("fsspec is not installed: pip install 'robot-hal[ray]'", name="fsspec") from error
-    try:
-        system, path = url_to_fs(address)
+        system, path = fsspec.core.url_to_fs(address)
     except ImportError as error:  # such as "Install s3fs to access S3"
         raise DriverMissing(f"{address}: {error}", name=error.name) from error
     except ValueError as error:

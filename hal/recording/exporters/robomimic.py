@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DriverMissing
+from ...errors import import_library
 from .actions import action_dict
 from .content import EpisodeContent, PictureStream, add_channel, picture_name
 from .output import ExportJob
@@ -29,7 +29,7 @@ def is_export(path: Path) -> bool:
 
 def write(job: ExportJob, path: Path) -> None:
     """Write the file. Raises DriverMissing without h5py."""
-    h5py = _library()
+    h5py = import_library("h5py", "an export for robomimic", "robot-hal[export]")
     with h5py.File(path, "w") as file:  # in HDF5's oldest version, which every library reads
         data = file.create_group("data")
         for k, content in enumerate(job.contents):
@@ -39,16 +39,6 @@ def write(job: ExportJob, path: Path) -> None:
         data.attrs["about"] = json.dumps(job.about())
         for name, demos in _filters(job).items():
             file[f"mask/{name}"] = np.array([f"demo_{k}" for k in demos], dtype="S")
-
-
-def _library() -> Any:
-    try:
-        import h5py
-    except ImportError:
-        raise DriverMissing(
-            "an export for robomimic needs h5py; install with: pip install 'robot-hal[export]'", name="h5py"
-        ) from None
-    return h5py
 
 
 def _write_episode(job: ExportJob, content: EpisodeContent, group: Any, h5py: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DriverMissing
+from ...errors import import_library
 from ...geometry import Pose
 from ...types import STREAMS, RobotStatus, Trip
 from ..dataset import Episode
@@ -24,7 +24,7 @@ _DEPTH_UNITS = 10_000.0
 
 def write_rrd(episode: Episode, path: Path) -> None:
     """Write the file. Raises DriverMissing without rerun-sdk, OSError, and the errors of reading the episode."""
-    rr = _library()
+    rr = import_library("rerun", "a file for the rerun viewer", "robot-hal[review]")
     content = EpisodeContent(episode)
     recording = rr.RecordingStream("robot-hal", recording_id=f"episode {episode.number}")
     recording.save(str(path), default_blueprint=_blueprint(content))
@@ -42,17 +42,6 @@ def write_rrd(episode: Episode, path: Path) -> None:
             _log_pictures(rr, recording, content, stream)
     finally:
         recording.disconnect()  # writes the rest and closes the file
-
-
-def _library() -> Any:
-    try:
-        import rerun
-    except ImportError:
-        raise DriverMissing(
-            "a file for the rerun viewer needs rerun-sdk; install with: pip install 'robot-hal[review]'",
-            name="rerun",
-        ) from None
-    return rerun
 
 
 def _blueprint(content: EpisodeContent) -> Any:
