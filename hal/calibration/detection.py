@@ -56,8 +56,6 @@ class BoardDetection:
     """The board in the camera's optical frame, by this image alone."""
     error_px: float
     """Distance of the corners from where that pose puts them, rms."""
-    blur_px: float = 0.0
-    """Width of the edges between black and white."""
 
 
 class CalibrationImage(NamedTuple):
@@ -111,14 +109,14 @@ class Detector:
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._detector = aruco.CharucoDetector(board.make_opencv(), aruco.CharucoParameters(), parameters)
 
-    def find_corners(self, picture: NDArray[np.uint8]) -> tuple[Array, Array, float]:
+    def find_corners(self, picture: NDArray[np.uint8]) -> tuple[Array, Array]:
         """Detect the board's corners, whatever the camera's intrinsics are.
 
         Args:
             picture: (H, W, 3) RGB, or (H, W).
 
         Returns:
-            The corners (n, 3) in the board's frame, m; their pixels (n, 2); and the width of the edges, pixels.
+            The corners (n, 3) in the board's frame, m, and their pixels (n, 2).
 
         Raises:
             NoView: The board is not in the image, or not visible well enough.
@@ -138,7 +136,7 @@ class Detector:
         blur = edge_width(grey, pixels, side)
         if blur > max(3.0, BLURRED * side):
             raise NoView(f"the image is blurred: edges are {blur:.1f} pixels wide, a square {side:.0f}", code="blurred")
-        return points, pixels, blur
+        return points, pixels
 
     def find(self, picture: NDArray[np.uint8], K: ArrayLike, distortion: ArrayLike) -> BoardDetection:
         """Detect the board.
@@ -151,7 +149,7 @@ class Detector:
         Raises:
             NoView: The board is not in the image, or not visible well enough.
         """
-        points, pixels, blur = self.find_corners(picture)
+        points, pixels = self.find_corners(picture)
         camera = np.asarray(K, float)
         try:
             pixels = undistort_pixels(pixels, camera, distortion)
@@ -167,7 +165,7 @@ class Detector:
         pose, rms = flat_pose(points, pixels, camera)
         if rms > _WORST_FIT:
             raise NoView(f"the corners are {rms:.1f} pixels off a flat board: {_NOT_FLAT}", code="not_flat")
-        return BoardDetection(points, pixels, camera, pose, rms, blur)
+        return BoardDetection(points, pixels, camera, pose, rms)
 
     def _check_enough(self, points: Array) -> None:
         total = (self.board.columns - 1) * (self.board.rows - 1)

@@ -90,7 +90,7 @@ class LensViews:
             NoView: The board is not visible well enough, or as in an earlier image.
         """
         self._size = (picture.shape[1], picture.shape[0])
-        points, pixels, _ = self._detector.find_corners(picture)
+        points, pixels = self._detector.find_corners(picture)
         for other_points, other_pixels in self._found:
             same, here, there = self._pair(points, other_points)
             if same and np.linalg.norm(pixels[here] - other_pixels[there], axis=1).mean() < _ALIKE * self._size[0]:

@@ -44,7 +44,6 @@ def test_corners_and_pose_are_found(lens: tuple[float, ...]) -> None:
     distance, angle = found.T_camera_board.distance(Pose.from_matrix(pose))
     assert distance < 1e-3
     assert angle < 5e-3
-    assert 1.0 < found.blur_px < 3.0
 
 
 def test_a_colour_image_of_a_part_of_the_board_is_enough() -> None:

@@ -26,9 +26,9 @@ class Corners:
     def __init__(self, seen: list[Any], noise_px: float) -> None:
         self.chance, self.noise, self.seen = np.random.default_rng(2), noise_px, iter(seen)
 
-    def find_corners(self, picture: Any) -> tuple[Any, Any, float]:
+    def find_corners(self, picture: Any) -> tuple[Any, Any]:
         pixels = pixels_of(next(self.seen), WEBCAM)
-        return BOARD.corners, pixels + self.noise * self.chance.normal(size=pixels.shape), 1.0
+        return BOARD.corners, pixels + self.noise * self.chance.normal(size=pixels.shape)
 
 
 def collect(seen: list[Any], noise_px: float = 0.1) -> LensViews:
