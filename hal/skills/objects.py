@@ -6,10 +6,10 @@ Everything is in the arm's base frame, whose z axis must point up.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,25 +203,22 @@ def locate_by_truth(rig: Rig, arm: Robot, name: str) -> LocatedObject:
 
 def _surface(shape: str, size: tuple[float, ...], file: str = "") -> Array:
     """Return points (k, 3) that outline a shape in its own frame, m; none for a shape that is not known here."""
-    if shape == "box":
-        corners = np.array(list(product((-1.0, 1.0), repeat=3)))
-        start, end = np.argwhere(np.abs(corners[:, None] - corners).sum(axis=2) == 2.0).T
-        corners *= np.array(size) / 2.0
-        return _lines(corners[start], corners[end])
-    if shape == "sphere":
-        return _rings(size[0], 0.0)
-    if shape == "cylinder":
-        ring = _ring(size[0])
-        half = np.full((len(ring), 1), 0.5 * size[1])
-        return np.concatenate([np.hstack([ring, half]), np.hstack([ring, -half])])
-    if shape == "capsule":
-        return _rings(size[0], 0.5 * size[1])
-    if shape == "mesh":
-        import trimesh
+    from trimesh import creation, load_mesh
 
-        mesh: Array = np.asarray(trimesh.load_mesh(file).vertices, float) * size
-        return mesh
-    return np.zeros((0, 3))
+    if shape == "mesh":
+        vertices: Array = np.asarray(load_mesh(file).vertices, float) * size
+        return vertices
+    makers: dict[str, Callable[[], Any]] = {
+        "box": lambda: creation.box(size),
+        "sphere": lambda: creation.icosphere(radius=size[0]),
+        "cylinder": lambda: creation.cylinder(*size),
+        "capsule": lambda: creation.capsule(size[1], size[0], count=[16, 16]),
+    }
+    if shape not in makers:
+        return np.zeros((0, 3))
+    mesh = makers[shape]()
+    points = mesh.vertices - mesh.bounds.mean(axis=0)  # some versions stand a capsule on its end
+    return _lines(*np.moveaxis(points[mesh.edges_unique], 1, 0))
 
 
 def _lines(starts: Array, ends: Array) -> Array:
@@ -230,19 +227,3 @@ def _lines(starts: Array, ends: Array) -> Array:
     steps = np.linspace(0.0, 1.0, max(2, int(longest / _FINE)))[:, None, None]
     points: Array = starts + steps * (ends - starts)
     return points.reshape(-1, 3)
-
-
-def _ring(radius: float) -> Array:
-    """Return points (k, 2) on a circle, m."""
-    angles = np.linspace(0.0, 2.0 * math.pi, max(16, int(2.0 * math.pi * radius / _FINE)), endpoint=False)
-    return radius * np.column_stack([np.cos(angles), np.sin(angles)])
-
-
-def _rings(radius: float, half: float) -> Array:
-    """Return points (k, 3) on a capsule along z whose caps begin at ``half``, m; 0 for a sphere."""
-    parts = []
-    for slope in np.linspace(0.0, 0.5 * math.pi, 8):
-        ring = _ring(radius * math.cos(slope))
-        height = np.full((len(ring), 1), half + radius * math.sin(slope))
-        parts += [np.hstack([ring, height]), np.hstack([ring, -height])]
-    return np.concatenate(parts)
