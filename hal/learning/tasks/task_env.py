@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from difflib import get_close_matches
-from inspect import signature
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
@@ -153,9 +151,8 @@ class TaskEnv(RigEnv):
         deadman: Callable[[Rig], Deadman] | None = None,
         unattended: bool = False,
         render_mode: str | None = None,
-        **unknown: Any,
     ) -> None:
-        _check_arguments(type(self), unknown, reward_type=(reward_type, RewardType), judge=(judge, Judge))
+        _check_choices(reward_type=(reward_type, RewardType), judge=(judge, Judge))
         self._sparse = reward_type == "sparse"
         self.poses: dict[str, Pose] = {}
         """Pose of each object in the arm's base frame, at the newest observation in which it was seen."""
@@ -474,13 +471,8 @@ class TaskEnv(RigEnv):
         }
 
 
-def _check_arguments(task: type[TaskEnv], unknown: Mapping[str, Any], **choices: tuple[Any, Any]) -> None:
-    """Raise CommandError for an unknown argument, or a value that is none of those allowed."""
-    known = [name for name in signature(TaskEnv).parameters if name != "unknown"]
-    for name in unknown:
-        near = get_close_matches(name, known, 1)
-        advice = f"did you mean {near[0]}=?" if near else f"its arguments: {', '.join(known)}"
-        raise CommandError(f"{task.__name__} has no argument {name!r}; {advice}", code="unknown_argument")
+def _check_choices(**choices: tuple[Any, Any]) -> None:
+    """Raise CommandError for a value that is none of those allowed."""
     for name, (value, kind) in choices.items():
         if value is not None and value not in get_args(kind):
             text = f"{name} is {' or '.join(get_args(kind))}, not {value!r}"
