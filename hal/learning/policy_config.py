@@ -467,7 +467,9 @@ def _read_state(name: str, observation: Observation, robot: Robot) -> Array:
     if name == "tcp_quaternion":
         return np.asarray(state.tcp.orientation)
     if name == "tcp_rpy":
-        return _rpy(quaternion_to_matrix(state.tcp.orientation))
+        from pinocchio.rpy import matrixToRpy
+
+        return np.asarray(matrixToRpy(quaternion_to_matrix(state.tcp.orientation)))
     if name == "tcp_rotvec":
         return np.array(difference((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, *state.tcp.orientation))[3:])
     width = observation.grippers[robot.name].width
@@ -492,12 +494,3 @@ def _fit_picture(color: NDArray[np.uint8], source: Source) -> NDArray[np.uint8]:
     if source.mirror:
         color = color[:, ::-1]
     return np.ascontiguousarray(color.transpose(2, 0, 1) if source.layout == "chw" else color)
-
-
-def _rpy(matrix: Array) -> Array:
-    """Return roll, pitch and yaw (3,) about the fixed axes, rad, of a rotation matrix."""
-    across = float(np.hypot(matrix[0, 0], matrix[1, 0]))
-    pitch = np.arctan2(-matrix[2, 0], across)
-    if across < 1e-9:  # gimbal lock: the yaw is 0 by choice
-        return np.array([np.arctan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0])
-    return np.array([np.arctan2(matrix[2, 1], matrix[2, 2]), pitch, np.arctan2(matrix[1, 0], matrix[0, 0])])
