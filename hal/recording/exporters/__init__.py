@@ -22,26 +22,14 @@ from .actions import ActionForm, ActionKind, RotationForm
 from .content import EpisodeContent, select_episodes
 from .output import ExportJob, ExportProgress, write_atomically
 
-__all__ = ["KINDS", "ExportResult", "ExportFormat", "ExportProgress", "default_path", "export"]
+__all__ = ["KINDS", "ExportResult", "ExportProgress", "default_path", "export"]
 
 
-class ExportFormat(NamedTuple):
-    """A format, and the module that writes it.
+KINDS = {"robomimic": ("robomimic", ".robomimic.hdf5"), "zarr": ("diffusion_policy", ".zarr"), "npz": ("npz", "_npz")}
+"""Kind of export -> the module that writes it, and what is appended to the dataset's name for the default path.
 
-    The module has ``write(job, path)``, and ``is_export(path)``, which recognises what it wrote before.
-    """
-
-    module: str
-    ending: str
-    """Appended to the dataset's name for the default path."""
-    what: str
-
-
-KINDS = {
-    "robomimic": ExportFormat("robomimic", ".robomimic.hdf5", "one HDF5 file as robomimic reads it"),
-    "zarr": ExportFormat("diffusion_policy", ".zarr", "a zarr folder as diffusion policy's replay buffer reads it"),
-    "npz": ExportFormat("npz", "_npz", "a folder with one .npz per episode"),
-}
+A module has ``write(job, path)``, and ``is_export(path)``, which recognises what it wrote before.
+"""
 
 
 class ExportResult(NamedTuple):
@@ -59,7 +47,7 @@ class ExportResult(NamedTuple):
 def default_path(dataset: str | Path, kind: str) -> Path:
     """Return the default path of an export: beside the dataset."""
     folder = Path(dataset).expanduser().absolute()
-    return folder.with_name(folder.name + KINDS[kind].ending)
+    return folder.with_name(folder.name + KINDS[kind][1])
 
 
 def export(
@@ -127,7 +115,7 @@ def export(
         notes=list(source.notes),
     )
     job.check()
-    writer = import_module(f".{KINDS[kind].module}", __name__)
+    writer = import_module(f".{KINDS[kind][0]}", __name__)
     path = default_path(source.root, kind) if out is None else Path(out).expanduser().absolute()
     with write_atomically(path, force=force, is_ours=writer.is_export) as beside:
         writer.write(job, beside)
