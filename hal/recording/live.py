@@ -16,13 +16,13 @@ import io
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..host.memory import Mailbox
-from ..host.ring import ArrayRing, Images
+from ..host.ring import ArrayRing
 from ..types import STREAMS
 from .codecs import DepthFile, DepthReader, ids_to_units, truncate_records
 from .layout import MORE_STREAMS, CameraSetup, read_json, sync_to_disk, write_json
@@ -33,36 +33,23 @@ from .videos import VideoEncoder, VideoFile, as_rgb, count_frames, truncate_to_l
 
 _STATUS = "dH2000s"  # free space in bytes, length of the trouble's text, the text
 _TEXT = 2000
-_VALUES = -1, ""
-"""Key of a row's numbers; a picture's is the index of its camera, and its stream."""
+VALUES = -1, ""
+"""Key of a row's numbers in its slot; a picture's is the index of its camera, and its stream. A picture that is not new
+keeps the slot's former content."""
 
 _Key = tuple[int, str]
+RowSlot = dict[_Key, NDArray[Any]]
+"""One row in the queue."""
 
 
-class RowSlot(NamedTuple):
-    """One row in the queue."""
-
-    values: NDArray[np.float64]
-    images: tuple[Images, ...]
-    """By stream, in the order of the cameras; a picture that is not new keeps the slot's former content."""
-
-
-class RowQueue:
+class RowQueue(ArrayRing[_Key]):
     """A queue of rows in shared memory, each with ``width`` numbers and the pictures of ``cameras``; read in place."""
 
     def __init__(self, buffer: memoryview, width: int, cameras: Sequence[CameraSetup], slots: int) -> None:
         """Lay the queue out in ``buffer``, which has :meth:`size` bytes and starts as zeros."""
+        super().__init__(buffer[_status_size() :], _arrays(width, cameras), slots)
         self._status = Mailbox(buffer, _STATUS)
         self._reported: tuple[float, str] = (0.0, "")
-        self._ring = ArrayRing(buffer[_status_size() :], _arrays(width, cameras), slots)
-        indices = range(len(cameras))
-        self._slots = {
-            id(slot): RowSlot(
-                slot[_VALUES],
-                tuple({stream: a for (k, stream), a in slot.items() if k == camera} for camera in indices),
-            )
-            for slot in self._ring.slots
-        }
 
     @staticmethod
     def size(width: int, cameras: Sequence[CameraSetup], slots: int) -> int:
@@ -72,22 +59,9 @@ class RowQueue:
     # In the app.
 
     @property
-    def is_full(self) -> bool:
-        """Whether there is no free slot."""
-        return self._ring.is_full
-
-    @property
     def is_half_full(self) -> bool:
         """Whether more than half of the slots are waiting."""
-        return 2 * self._ring.waiting > len(self._ring.slots)
-
-    def open_slot(self) -> RowSlot:
-        """Return the free slot to be filled; call it only if the queue is not full."""
-        return self._slots[id(self._ring.open_slot())]
-
-    def publish(self) -> None:
-        """Publish the slot that was filled."""
-        self._ring.publish()
+        return 2 * self.waiting > len(self.slots)
 
     @property
     def free_bytes(self) -> int:
@@ -102,15 +76,6 @@ class RowQueue:
         return found[1][2][: found[1][1]].decode(errors="replace") if found is not None else ""
 
     # In the writer's process.
-
-    def oldest(self) -> RowSlot | None:
-        """Return the next row to be written; None if there is none."""
-        slot = self._ring.oldest()
-        return None if slot is None else self._slots[id(slot)]
-
-    def release_oldest(self) -> None:
-        """Free the slot of the oldest row."""
-        self._ring.release_oldest()
 
     def report(self, free_bytes: int | None = None, trouble: str | None = None) -> None:
         """Report free space, trouble or both to the app; what is None keeps its value."""
@@ -129,7 +94,7 @@ def _status_size() -> int:
 
 def _arrays(width: int, cameras: Sequence[CameraSetup]) -> dict[_Key, tuple[tuple[int, ...], DTypeLike]]:
     """Return shape and type of every array of a row."""
-    arrays: dict[_Key, tuple[tuple[int, ...], DTypeLike]] = {_VALUES: ((width,), np.float64)}
+    arrays: dict[_Key, tuple[tuple[int, ...], DTypeLike]] = {VALUES: ((width,), np.float64)}
     for index, camera in enumerate(cameras):
         for stream in (*camera.videos.values(), *camera.depths.values()):
             kind = STREAMS[stream]
@@ -183,19 +148,21 @@ class LiveFolder:
 
     def add(self, slot: RowSlot) -> None:
         """Write one row, its numbers last, so that no row that can be read back lacks its pictures."""
-        for camera, images in zip(self.cameras, slot.images, strict=True):
-            new = self._seen.get(camera.name) != slot.values[camera.seq]
-            self._seen[camera.name] = float(slot.values[camera.seq])
+        values = slot[VALUES]
+        for k, camera in enumerate(self.cameras):
+            new = self._seen.get(camera.name) != values[camera.seq]
+            self._seen[camera.name] = float(values[camera.seq])
             for name, stream in camera.videos.items():
                 if new:
-                    self._colors[name] = as_rgb(images[stream])
+                    self._colors[name] = as_rgb(slot[k, stream])
                 self._videos[name].add(self._colors[name])
             for name, stream in camera.depths.items():
                 if stream == "depth":
-                    self._depths[name].add(images[stream] if new else None)
+                    self._depths[name].add(slot[k, stream] if new else None)
                 else:
-                    self._depths[name].add_units(ids_to_units(images[stream], STREAMS[stream].lowest) if new else None)
-        row = self._pa.FixedSizeListArray.from_arrays(self._pa.array(slot.values), len(slot.values))
+                    units = ids_to_units(slot[k, stream], STREAMS[stream].lowest) if new else None
+                    self._depths[name].add_units(units)
+        row = self._pa.FixedSizeListArray.from_arrays(self._pa.array(values), len(values))
         self._rows.write_batch(self._pa.record_batch([row], schema=self._schema))
         self.count += 1
 

@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,7 +23,7 @@ from .checking import check_compatible, known_columns
 from .finish import write_mark
 from .index import read_index
 from .layout import DatasetLayout, features_of, lock_dataset, make_plain, require_libraries
-from .live import RowQueue
+from .live import VALUES, RowQueue
 from .merging import pack_if_loose
 from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
 from .sample_clock import LockStepSampleClock, RealTimeSampleClock, SampleClock
@@ -133,8 +134,6 @@ class Recorder:
         self._warn_free = warn_free
         setups = [buffer.setup for buffer in self._buffers]
         width, slots = self._sampler.width, max(4, round(_QUEUE * fps))
-        self._memory = SharedMemory(RowQueue.size(width, setups, slots))
-        self._queue = RowQueue(self._memory.buffer, width, setups, slots)
         self._config = {
             "out": str(self.root),
             "cameras": setups,
@@ -143,12 +142,12 @@ class Recorder:
             "codec": codec,
             "stop_free": stop_free,
         }
-        try:
+        with ExitStack() as undo:
+            self._memory = SharedMemory(RowQueue.size(width, setups, slots))
+            undo.callback(self._memory.close)
+            self._queue = RowQueue(self._memory.buffer, width, setups, slots)
             self._child = self._start_child()
-        except BaseException:
-            self._memory.close()
-            raise
-        try:
+            undo.callback(self._child.close)
             encoder = VideoEncoder(*self._child.ready["encoder"])
             self._about = {
                 "fps": fps,
@@ -160,10 +159,7 @@ class Recorder:
                 **rig_metadata(rig),
             }
             check_compatible(DatasetLayout(out), self._about, setups)
-        except BaseException:
-            self._child.close()
-            self._memory.close()
-            raise
+            undo.pop_all()  # nothing failed
         self._lock = threading.RLock()
         self._current: EpisodeRecorder | None = None
         """The current episode, or the last one."""
@@ -451,9 +447,10 @@ class EpisodeRecorder:
         if self._queue.is_full and not (self._lock_step and self._wait_for_slot()):
             return "the writer cannot keep up: the processor or the disk is too slow"
         slot = self._queue.open_slot()
-        slot.values[:] = values
+        slot[VALUES][:] = values
         self.pace.add(values)
-        for buffer, images in zip(self._buffers, slot.images, strict=True):
+        for k, buffer in enumerate(self._buffers):
+            images = {stream: image for (camera, stream), image in slot.items() if camera == k}
             buffer.copy_into(frames[buffer.camera.name], images)
         self._queue.publish()
         if not self._lock_step or self._queue.is_half_full:  # in lock-step rows come fast: wake the writer for several

@@ -110,7 +110,7 @@ def record_tour(out: Path, seconds: float = 60.0) -> Path:
 def kill_writer(recorder: Recorder) -> None:
     """Kill the process that writes the present episode, once some rows are on the disk."""
     deadline = time.monotonic() + 30.0
-    while (recorder.status().frames < 5 or recorder._queue._ring.waiting) and time.monotonic() < deadline:
+    while (recorder.status().frames < 5 or recorder._queue.waiting) and time.monotonic() < deadline:
         time.sleep(0.01)
     recorder._child.process.kill()
     recorder._child.process.wait()
