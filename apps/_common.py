@@ -397,8 +397,10 @@ def find_pad(rig: Rig, robot: Robot | None = None) -> Gamepad | None:
     return next(iter([*leaders, *pads]), None)
 
 
-def find_deadman(rig: Rig, robot: Robot | None = None) -> tuple[Deadman, TeleopMapping, str]:
+def find_deadman(rig: Rig, robot: Robot | None = None, *, steps: bool = False) -> tuple[Deadman, TeleopMapping, str]:
     """Return the dead-man of the rig's pad, the pad's mapping, and the name of the dead-man's control.
+
+    With ``steps`` it may be a pad that makes a step for each press.
 
     Raises:
         CommandError: The rig has no pad (code ``no_gamepad``), or its pad's controls cannot be held (``cannot_hold``).
@@ -409,7 +411,7 @@ def find_deadman(rig: Rig, robot: Robot | None = None) -> tuple[Deadman, TeleopM
     if pad is None:
         message = f"{rig.plan.source} has no gamepad to hold as the dead-man; see --pad and --unattended"
         raise CommandError(message, code="no_gamepad")
-    if not pad.can_hold:
+    if not pad.can_hold and not steps:
         message = "keys of this terminal make one step for each press, and the dead-man must be held: use --pad web"
         raise CommandError(message, code="cannot_hold")
     mapping = load_mapping(pad.mapping or "default")

@@ -9,17 +9,17 @@ import hal
 from hal.apps._common import (
     add_rig_options,
     check_one_robot,
+    find_deadman,
     resolve_plan,
     rig_options,
     robot_names,
     select_robots,
 )
 from hal.apps._display import banner, list_links
-from hal.errors import CommandError, MotionStopped, NotSupported
+from hal.errors import MotionStopped, NotSupported
 
 if TYPE_CHECKING:
     from hal.deadman import Deadman
-    from hal.gamepad import Gamepad
     from hal.gripper import Gripper, GripperResult
     from hal.rig import Rig
     from hal.specs import Plan, RobotSpec
@@ -94,17 +94,11 @@ def _find_deadman(rig: Rig, spec: RobotSpec) -> Deadman:
         CommandError: The rig has no pad.
         NotSupported: It must not be the dead-man of a real gripper.
     """
-    from hal.config.mapping import load_mapping
-
-    pad: Gamepad | None = next(iter(rig.gamepads.values()), None)
-    if pad is None:
-        raise CommandError(f"{rig.plan.source} has no gamepad to hold as the dead-man; see --pad", code="no_gamepad")
-    control = load_mapping(pad.mapping or "default").deadman
-    deadman = pad.hold(control)
+    deadman, _, name = find_deadman(rig, steps=True)
     if spec.attended and not spec.emulated:
         deadman.check_trust()
-    name = pad.control_name(control)
-    how = f"hold {name}: the fingers move only while it is held" if pad.can_hold else f"press {name}: one step each"
+    holds = next(iter(rig.gamepads.values())).can_hold
+    how = f"hold {name}: the fingers move only while it is held" if holds else f"press {name}: one step each"
     text = f"take everything out from between the fingers; then {how}"
     print(f"  {text}", flush=True)
     rig.say(text)
