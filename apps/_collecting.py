@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -74,7 +75,7 @@ class CollectRun:
         )
         self.session = self.display.session
         self.pad = self.session.pad
-        self.tape = BackgroundRecorder(recorder)
+        self._calls = ThreadPoolExecutor(1, "hal-recorder")
         recorder.source = lambda: "person"
         self.phase = ""
         self.kept: list[SavedEpisode] = []
@@ -133,15 +134,40 @@ class CollectRun:
         """Write everything to disk. The first Ctrl-C meanwhile prints a message, the second one aborts."""
         for last in (False, True):
             try:
-                if (rest := self.tape.save_rest()) is not None:
+                wait([call for call in (self._starting, self._discarding) if call is not None])
+                if self.recorder.status().state == "recording":
                     self.session.announce(f"episode {self.number} was being recorded: saved, unmarked")
-                    self.kept.append(SavedEpisode(self.number, self._seed, None, rest))
-                self.tape.close()
+                    self.kept.append(SavedEpisode(self.number, self._seed, None, self._save(None)))
+                self._calls.shutdown()
+                self.recorder.close()
                 return
             except KeyboardInterrupt:
                 if last:
                     raise
                 self.session.announce("saving; press Ctrl-C again to abort")
+
+    def _call(self, function: Callable[[], T]) -> Future[T]:
+        """Call a slow function of the recorder in a thread, one after the other; at once where simulated time stands.
+
+        The future holds its error, if there is one.
+        """
+        if not self.rig.lock_step:
+            return self._calls.submit(function)
+        done: Future[T] = Future()
+        try:
+            done.set_result(function())
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+    def _save(self, success: bool | None) -> Future[RecorderStatus]:
+        """End the episode now; return the recorder's status when it is saved, which is later, also in lock-step."""
+        self.recorder.save(success)
+        return self._calls.submit(self._saved_status)
+
+    def _saved_status(self) -> RecorderStatus:
+        self.recorder.wait_saved()
+        return self.recorder.status()
 
     # One episode.
 
@@ -233,16 +259,17 @@ class CollectRun:
             info = {"program": "collect", "robot": self._names, "mapping": self.session.mapping}
             self._seed = self.seed
             self._record_time = self.rig.clock.now() - self.display.report.start
-            self._starting = self.tape.start(self._seed, info | {"speed": self.args.speed or 1.0})
+            start = partial(self.recorder.start, seed=self._seed, info=info | {"speed": self.args.speed or 1.0})
+            self._starting = self._call(start)
             self._check_tape()
             return ""
         if action == "discard" and self.phase == "ready":
             return SHUFFLED
         if action == "discard":
-            self._discarding = self.tape.discard()
+            self._discarding = self._call(self.recorder.discard)
             return DISCARDED
         success, seconds = self._mark(action), self.recorder.status().seconds
-        self.kept.append(SavedEpisode(self.number, self._seed, success, self.tape.save(success)))
+        self.kept.append(SavedEpisode(self.number, self._seed, success, self._save(success)))
         if self.rig.lock_step:
             wait([self.kept[-1].status])  # simulated time stands still meanwhile
         mark = {True: "success", False: "failure", None: "not marked"}[success]
@@ -434,63 +461,6 @@ def _summary(kept: Sequence[SavedEpisode], root: Path, discarded: int, ended: st
     )
     if saved:
         yield f"view them: hal review {root}"
-
-
-class BackgroundRecorder:
-    """A recorder for a loop that must not wait: slow calls run one after the other in a thread.
-
-    In lock-step they run at once, as simulated time stands still. :meth:`start` and :meth:`discard` return a future,
-    which holds the error if there was one.
-    """
-
-    def __init__(self, recorder: Recorder) -> None:
-        self.recorder = recorder
-        self._at_once = recorder.rig.lock_step
-        self._thread = ThreadPoolExecutor(1, "hal-recorder")
-
-    def start(self, seed: int, info: Mapping[str, Any]) -> Future[None]:
-        """Start an episode, once the last one is saved."""
-        return self._call(lambda: self.recorder.start(seed=seed, info=info))
-
-    def save(self, success: bool | None) -> Future[RecorderStatus]:
-        """End the episode now and save it.
-
-        Returns:
-            The recorder's status when it is saved, which is later, also in lock-step.
-
-        Raises:
-            CommandError: No episode is being recorded.
-        """
-        self.recorder.save(success)
-        return self._thread.submit(self._saved_status)
-
-    def _saved_status(self) -> RecorderStatus:
-        self.recorder.wait_saved()
-        return self.recorder.status()
-
-    def discard(self) -> Future[None]:
-        """Discard the episode."""
-        return self._call(self.recorder.discard)
-
-    def _call(self, function: Callable[[], T]) -> Future[T]:
-        if not self._at_once:
-            return self._thread.submit(function)
-        done: Future[T] = Future()
-        try:
-            done.set_result(function())
-        except Exception as error:
-            done.set_exception(error)
-        return done
-
-    def save_rest(self) -> Future[RecorderStatus] | None:
-        """Save an episode that is still being recorded, unmarked; return None if there is none."""
-        self._call(lambda: None).result()  # wait for a start in progress
-        return self.save(None) if self.recorder.status().state == "recording" else None
-
-    def close(self) -> None:
-        """Wait for all calls. May be called again after an interruption."""
-        self._thread.shutdown()
-        self.recorder.close()
 
 
 def lifts_cube(rig: Rig, robot: Robot) -> Judge | None:

@@ -130,10 +130,10 @@ def main(args: argparse.Namespace) -> int:
     with ExitStack() as cluster:
         start_worker: StartWorker = LocalWorker
         if args.ray:
-            from hal.learning.ray_workers import RayCluster
+            from hal.learning.ray_workers import join_cluster
 
-            joined = RayCluster(args.ray, args.workers, gpus=args.gpus, runtime_env=runtime_env)
-            start_worker = cluster.enter_context(joined).start_worker
+            joined = join_cluster(args.ray, args.workers, gpus=args.gpus, runtime_env=runtime_env)
+            start_worker = cluster.enter_context(joined)
         try:
             made = generate(
                 _recipe(args, plan, cameras),

@@ -6,15 +6,14 @@ import logging
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from types import TracebackType
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from ..errors import CommandError, ConnectionLost, import_library
 from ..host.process import pack_error, unpack_error
 from .episode_worker import EpisodeResult, EpisodeWorker
-from .generate import LONGEST, WorkerHandle
+from .generate import LONGEST, StartWorker, WorkerHandle
 
 _STORE = 80_000_000
 """Memory for Ray's objects on a cluster that is started here, bytes: close to Ray's least. Results are small."""
@@ -24,8 +23,11 @@ _CLOSING = 60.0
 """Time in which a worker must have closed its dataset, s."""
 
 
-class RayCluster:
-    """A connection to a Ray cluster, to be used in a ``with`` statement.
+@contextmanager
+def join_cluster(
+    address: str, workers: int, *, gpus: float = 0.0, runtime_env: Mapping[str, Any] | None = None
+) -> Iterator[StartWorker]:
+    """Connect to a Ray cluster for a ``with`` statement; yield the function that starts a worker there.
 
     Args:
         address: Of the cluster, as :func:`ray.init` takes it; ``local`` starts one on this computer, with neither
@@ -38,19 +40,14 @@ class RayCluster:
         DriverMissing: Ray is not installed.
         ConnectionLost: The cluster does not answer (code ``no_cluster``).
     """
-
-    def __init__(
-        self, address: str, workers: int, *, gpus: float = 0.0, runtime_env: Mapping[str, Any] | None = None
-    ) -> None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when Ray is imported
-        self._ray = ray = import_library("ray", "--ray", "robot-hal[ray]")
-        self._gpus = gpus
-        own: dict[str, Any] = {"runtime_env": dict(runtime_env)} if runtime_env else {}
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when Ray is imported
+    ray = import_library("ray", "--ray", "robot-hal[ray]")
+    own: dict[str, Any] = {"runtime_env": dict(runtime_env)} if runtime_env else {}
+    with ExitStack() as closing:
         if address == "local":
-            self._folder = tempfile.TemporaryDirectory(prefix="hal-ray-", ignore_cleanup_errors=True)
+            folder = tempfile.TemporaryDirectory(prefix="hal-ray-", ignore_cleanup_errors=True)
             own |= {
-                "_temp_dir": self._folder.name,
+                "_temp_dir": closing.enter_context(folder),
                 "num_cpus": workers,
                 "include_dashboard": False,
                 "object_store_memory": _STORE,
@@ -60,20 +57,8 @@ class RayCluster:
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **own)
         except Exception as error:
             raise ConnectionLost(f"--ray {address}: {error}", code="no_cluster") from error
-
-    def __enter__(self) -> RayCluster:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ray.shutdown()
-        if self._folder is not None:
-            self._folder.cleanup()
-
-    def start_worker(self, recipe: dict[str, Any], folder: str, index: int) -> RayWorker:
-        """Start a worker; see :data:`~hal.learning.generate.StartWorker`."""
-        return RayWorker(self._ray, recipe, folder, self._gpus)
+        closing.callback(ray.shutdown)
+        yield lambda recipe, folder, index: RayWorker(ray, recipe, folder, gpus)
 
 
 class RayWorker(WorkerHandle):
