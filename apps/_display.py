@@ -190,6 +190,18 @@ class StatusLine:
             self._live = False
 
 
+def show_episodes(stream: TextIO | None = None) -> Callable[[int, int], None]:
+    """Return a function that shows in a live line how many episodes of all are done."""
+    line = StatusLine(stream)
+
+    def show(done: int, total: int) -> None:
+        line.update(lambda: f"  {done} of {total} episodes")
+        if done == total:
+            line.clear()
+
+    return show
+
+
 class TeleopDisplay:
     """A :class:`hal.TeleopSession` in a terminal: prints its events, draws the live line and measures the run."""
 

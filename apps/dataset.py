@@ -15,12 +15,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from hal.apps._common import program
-from hal.apps._display import StatusLine, count_episodes
+from hal.apps._display import count_episodes, show_episodes
 from hal.errors import CommandError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from hal.recording import Dataset, Episode
 
 MARKS: dict[str, bool | None] = {"success": True, "failure": False, "none": None}
@@ -104,7 +102,7 @@ def main(args: argparse.Namespace) -> int:
     from hal.recording.exporters.content import select_episodes
 
     if args.command == "merge":
-        count = merge(args.datasets, args.out, on_episode=_progress())
+        count = merge(args.datasets, args.out, on_episode=show_episodes())
         print(f"{args.out}: {count_episodes(count)}")
         return 0
     if args.command in ("check", "repair"):
@@ -179,7 +177,7 @@ def _trim(dataset: Dataset, chosen: list[int], args: argparse.Namespace) -> None
     if args.dry_run or not kept:
         print(f"{total} would be removed" if kept else "nothing to trim")
     elif args.out or args.yes or _ask(f"remove {total} of {dataset.root}, for good?"):
-        trim(dataset, kept, args.out, on_episode=_progress())
+        trim(dataset, kept, args.out, on_episode=show_episodes())
         print(f"{args.out or dataset.root}: {total} removed")
     else:
         print("nothing was removed")
@@ -215,17 +213,6 @@ def _ask(question: str) -> bool:
     if not sys.stdin.isatty():
         raise CommandError(f"{question} repeat the command with --yes", code="not_confirmed")
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
-
-
-def _progress() -> Callable[[int, int], None]:
-    line = StatusLine()
-
-    def show(done: int, total: int) -> None:
-        line.update(lambda: f"  {done} of {total} episodes")
-        if done == total:
-            line.clear()
-
-    return show
 
 
 if __name__ == "__main__":

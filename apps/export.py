@@ -10,15 +10,10 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from hal.apps._common import program, split_names
-from hal.apps._display import StatusLine, count_episodes
+from hal.apps._display import count_episodes, show_episodes
 from hal.errors import CommandError
-
-if TYPE_CHECKING:
-    from hal.recording.exporters import ExportProgress
 
 
 def parser() -> argparse.ArgumentParser:
@@ -90,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
         action=args.action,
         rotation=args.rotation,
         force=args.force,
-        progress=_show_progress(),
+        on_episode=show_episodes(sys.stderr),
     )
     for note in made.notes:
         print(f"note: {note}")
@@ -105,18 +100,6 @@ def _size(text: str | None) -> tuple[int, int] | None:
     if match is None:
         raise CommandError(f"--resize takes a width and a height, such as 96x96, not {text!r}")
     return int(match[1]), int(match[2])
-
-
-def _show_progress() -> Callable[[ExportProgress], None]:
-    """Return a function that shows the progress in one line of the terminal."""
-    line = StatusLine(sys.stderr)
-
-    def show(progress: ExportProgress) -> None:
-        line.update(lambda: f"{100 * progress.share:3.0f} %  episode {progress.episode}")
-        if progress.share >= 1.0:
-            line.clear()
-
-    return show
 
 
 if __name__ == "__main__":

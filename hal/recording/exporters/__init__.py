@@ -20,9 +20,9 @@ from ..dataset import Dataset
 from ..layout import count_bytes
 from .actions import ActionForm, ActionKind, RotationForm
 from .content import EpisodeContent, select_episodes
-from .output import ExportJob, ExportProgress, write_atomically
+from .output import ExportJob, write_atomically
 
-__all__ = ["KINDS", "ExportResult", "ExportProgress", "default_path", "export"]
+__all__ = ["KINDS", "ExportResult", "default_path", "export"]
 
 
 KINDS = {"robomimic": ("robomimic", ".robomimic.hdf5"), "zarr": ("diffusion_policy", ".zarr"), "npz": ("npz", "_npz")}
@@ -66,7 +66,7 @@ def export(
     action: ActionKind = "joint_position",
     rotation: RotationForm | None = None,
     force: bool = False,
-    progress: Callable[[ExportProgress], None] | None = None,
+    on_episode: Callable[[int, int], object] = lambda done, total: None,
 ) -> ExportResult:
     """Write episodes of a dataset in another format. The output appears only when complete.
 
@@ -86,7 +86,7 @@ def export(
             :class:`~hal.recording.exporters.actions.ActionForm`.
         rotation: Rotation of ``tcp_pose`` and ``tcp_delta``: ``quaternion`` (if None), ``axis_angle``, ``rotation_6d``.
         force: Overwrite an existing export; other files are never overwritten.
-        progress: Called as the export advances.
+        on_episode: Called with the number of written episodes and of all, after each.
 
     Raises:
         CommandError: An argument is wrong, the episodes differ, or something exists at ``out`` (codes ``bad_export``,
@@ -111,7 +111,7 @@ def export(
         gripper_camera=gripper_camera,
         valid=valid,
         action=form,
-        report=progress,
+        on_episode=on_episode,
         notes=list(source.notes),
     )
     job.check()

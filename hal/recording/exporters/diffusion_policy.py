@@ -107,7 +107,7 @@ def write(job: ExportJob, path: Path) -> None:
     lengths = [content.rows for content in job.contents]
     arrays: dict[str, ZarrArray] = {}
     with ExitStack() as stack:
-        for content in job.contents:
+        for content in job.episodes():
             for name, dtype, shape, parts in _columns(job, content):
                 if name not in arrays:
                     arrays[name] = ZarrArray(data / name, shape, dtype, sum(lengths))
@@ -130,7 +130,6 @@ def _columns(
     job.unknown(content, numbers)
     for name, values in numbers.items():
         yield name, values.dtype, values.shape[1:], iter(values)
-    job.numbers_done(content)
     for stream in content.pictures:
         shape = stream.shape if len(stream.shape) == 3 else (*stream.shape, 1)
-        yield picture_name(stream), stream.dtype, shape, map(add_channel, job.pictures(content, stream))
+        yield picture_name(stream), stream.dtype, shape, map(add_channel, stream)

@@ -33,7 +33,7 @@ def write(job: ExportJob, path: Path) -> None:
     """Write the folder."""
     path.mkdir()
     files = []
-    for content in job.contents:
+    for content in job.episodes():
         name = f"episode_{content.episode.number:06d}.npz"
         _write_episode(job, content, path / name)
         files.append({"file": name, **content.about()})
@@ -64,9 +64,8 @@ def _write_episode(job: ExportJob, content: EpisodeContent, path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as file:
         for name, values in (numbers | {name: np.array(text) for name, text in texts.items()}).items():
             _add(file, name, values.shape, values.dtype, iter([values]))
-        job.numbers_done(content)
         for name, stream in streams.items():
-            _add(file, name, (stream.rows, *stream.shape), stream.dtype, job.pictures(content, stream))
+            _add(file, name, (stream.rows, *stream.shape), stream.dtype, iter(stream))
 
 
 def _numbers(job: ExportJob, content: EpisodeContent) -> dict[str, NDArray[Any]]:

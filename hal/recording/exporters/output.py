@@ -1,4 +1,4 @@
-"""An export while it is written: its contents and progress, and an output that appears only when complete."""
+"""An export while it is written: its contents, and an output that appears only when complete."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +17,12 @@ from numpy.typing import NDArray
 from ...errors import CommandError
 from ..layout import STATE, put_in_place
 from .actions import ActionForm, rotation_observations
-from .content import EpisodeContent, PictureStream, observations
-
-
-class ExportProgress(NamedTuple):
-    """Progress of an export."""
-
-    episode: int
-    """Number of the episode that is being written."""
-    share: float
-    """Share of the whole export, 0 to 1."""
+from .content import EpisodeContent, observations
 
 
 @dataclass
 class ExportJob:
-    """The task of a format's module: episodes, options and progress of one export."""
+    """The task of a format's module: episodes and options of one export."""
 
     source: Path
     contents: tuple[EpisodeContent, ...]
@@ -40,10 +30,16 @@ class ExportJob:
     gripper_camera: str | None = None
     valid: float = 0.1
     action: ActionForm = field(default_factory=ActionForm)
-    report: Callable[[ExportProgress], None] | None = None
+    on_episode: Callable[[int, int], object] = lambda done, total: None
+    """Called with the number of written episodes and of all, after each."""
     notes: list[str] = field(default_factory=list)
     """Warnings to read before training on it."""
-    _done: int = 0
+
+    def episodes(self) -> Iterator[EpisodeContent]:
+        """Yield the episodes, each of which is to be written before the next one."""
+        for done, content in enumerate(self.contents, start=1):
+            yield content
+            self.on_episode(done, len(self.contents))
 
     def check(self) -> None:
         """Check that the episodes can be exported together.
@@ -74,26 +70,6 @@ class ExportJob:
     def observations(self, content: EpisodeContent) -> dict[str, NDArray[Any]]:
         """Return the observations of an episode, and the orientation of its tcp in the form of the actions."""
         return observations(content) | rotation_observations(content, self.action.rotation)
-
-    def pictures(self, content: EpisodeContent, stream: PictureStream) -> Iterator[NDArray[Any]]:
-        """Yield the pictures of a stream, and report progress."""
-        for picture in stream:
-            yield picture
-            self._step(content, 1)
-
-    def numbers_done(self, content: EpisodeContent) -> None:
-        """Report that the numbers of an episode are written."""
-        self._step(content, content.rows)
-
-    @cached_property
-    def _total(self) -> int:
-        """Number of rows of numbers and of pictures that are written in all."""
-        return sum(each.rows * (1 + len(each.pictures)) for each in self.contents)
-
-    def _step(self, content: EpisodeContent, count: int) -> None:
-        self._done += count
-        if self.report is not None:
-            self.report(ExportProgress(content.episode.number, min(1.0, self._done / max(1, self._total))))
 
     def about(self) -> dict[str, Any]:
         """Return the metadata of all episodes together."""

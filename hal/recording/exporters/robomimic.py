@@ -32,7 +32,7 @@ def write(job: ExportJob, path: Path) -> None:
     h5py = import_library("h5py", "an export for robomimic", "robot-hal[export]")
     with h5py.File(path, "w") as file:  # in HDF5's oldest version, which every library reads
         data = file.create_group("data")
-        for k, content in enumerate(job.contents):
+        for k, content in enumerate(job.episodes()):
             _write_episode(job, content, data.create_group(f"demo_{k}"), h5py)
         data.attrs["total"] = sum(content.rows for content in job.contents)
         data.attrs["env_args"] = json.dumps(_environment(job))
@@ -58,12 +58,11 @@ def _write_episode(job: ExportJob, content: EpisodeContent, group: Any, h5py: An
     for name, values in seen.items():
         group[f"obs/{name}"] = values
         group[f"next_obs/{name}"] = np.concatenate([values[1:], values[-1:]])
-    job.numbers_done(content)
     for stream in content.pictures:
-        _write_pictures(job, content, stream, group, h5py)
+        _write_pictures(stream, group, h5py)
 
 
-def _write_pictures(job: ExportJob, content: EpisodeContent, stream: PictureStream, group: Any, h5py: Any) -> None:
+def _write_pictures(stream: PictureStream, group: Any, h5py: Any) -> None:
     name = picture_name(stream)
     shape = stream.shape if len(stream.shape) == 3 else (*stream.shape, 1)
     pictures = group["obs"].create_dataset(
@@ -75,7 +74,7 @@ def _write_pictures(job: ExportJob, content: EpisodeContent, stream: PictureStre
         compression_opts=1,
         shuffle=stream.dtype.itemsize > 1,
     )
-    for k, picture in enumerate(job.pictures(content, stream)):
+    for k, picture in enumerate(stream):
         pictures[k] = add_channel(picture)
     # The next picture is already in the file, one row further: a view of it instead of a copy.
     view = h5py.VirtualLayout(pictures.shape, pictures.dtype)

@@ -112,11 +112,11 @@ def test_an_export_that_fails_leaves_the_old_one(dataset: Dataset, tmp_path: Pat
     export(dataset, "npz", path, cameras=[])
     before = sorted((file.name, file.stat().st_mtime_ns) for file in path.iterdir())
 
-    def stop(progress: object) -> None:
+    def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        export(dataset, "npz", path, force=True, progress=stop)
+        export(dataset, "npz", path, force=True, on_episode=stop)
     assert sorted((file.name, file.stat().st_mtime_ns) for file in path.iterdir()) == before
     assert [file.name for file in tmp_path.iterdir()] == ["out"]
 
@@ -163,12 +163,8 @@ def test_pictures_are_cropped_and_scaled_and_the_lens_with_them(dataset: Dataset
 
 def test_progress_goes_from_nothing_to_all(dataset: Dataset, tmp_path: Path) -> None:
     reports = []
-    export(dataset, "npz", tmp_path / "out", progress=reports.append)
-    shares = [progress.share for progress in reports]
-    assert shares == sorted(shares)
-    assert 0.0 < shares[0] < 0.2
-    assert shares[-1] == 1.0
-    assert [progress.episode for progress in reports] == sorted(progress.episode for progress in reports)
+    export(dataset, "npz", tmp_path / "out", on_episode=lambda done, total: reports.append((done, total)))
+    assert reports == [(done + 1, len(dataset)) for done in range(len(dataset))]
 
 
 def test_episodes_with_different_pictures_are_refused(tmp_path: Path) -> None:
