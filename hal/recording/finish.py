@@ -88,12 +88,8 @@ def rows_table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Any])
     """Return the Arrow table of an episode's rows, from columns (rows, n), in the order and types of ``features``."""
     import pyarrow as pa
 
-    arrays = {}
-    for key, feature in features.items():
-        if feature["dtype"] == "video":
-            continue
-        arrays[key] = make_column(columns[key].astype(feature["dtype"]))
-    return pa.table(arrays)
+    types = {key: feature["dtype"] for key, feature in features.items() if feature["dtype"] != "video"}
+    return pa.table({key: make_column(columns[key].astype(dtype)) for key, dtype in types.items()})
 
 
 def entry_row(

@@ -5,18 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import CommandError, DeviceNotFound
+from ...errors import CommandError
 from ...images import Cropping
 from ...types import STREAMS
 from ..changing import existing_episodes
 from ..dataset import Dataset, Episode
-from ..layout import GRIP_FORCE, MORE_STREAMS, STATE, TAU_EXT, WRENCH_EXT
+from ..layout import GRIP_FORCE, STATE, TAU_EXT, WRENCH_EXT
 
 _PART = re.compile(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?")
 
@@ -171,23 +171,16 @@ class EpisodeContent:
     @cached_property
     def pictures(self) -> tuple[PictureStream, ...]:
         """Every selected stream of pictures."""
-        found = []
-        for camera in self.cameras:
-            for what in ("rgb", "depth", *MORE_STREAMS) if self._depth else ("rgb", *MORE_STREAMS):
-                if (stream := self._stream(camera, what)) is not None:
-                    found.append(stream)
-        return tuple(found)
+        return tuple(
+            self._stream(camera, stream)
+            for camera in self.cameras
+            for stream in self.episode.files(camera)
+            if self._depth or stream != "depth"
+        )
 
-    def _stream(self, camera: str, what: str) -> PictureStream | None:
-        episode, stream = self.episode, "color" if what == "rgb" else what
-
-        def read() -> Iterator[NDArray[Any]]:
-            return episode.pictures(camera, stream)
-
-        try:
-            first = next(read())
-        except DeviceNotFound:  # this stream was not recorded
-            return None
+    def _stream(self, camera: str, stream: str) -> PictureStream:
+        read = partial(self.episode.pictures, camera, stream)
+        first, what = next(read()), "rgb" if stream == "color" else stream
         scaling = self._scaling(first.shape[1], first.shape[0])
         if scaling is None:
             return PictureStream(camera, what, first.shape, first.dtype, self.rows, read)
@@ -219,10 +212,7 @@ class EpisodeContent:
         return found
 
     def _recorded_size(self, camera: str) -> tuple[int, int]:
-        try:
-            first: NDArray[Any] = next(self.episode.frames(camera))
-        except DeviceNotFound:  # only depth was kept
-            first = self.episode.depth[camera][0]
+        first: NDArray[Any] = next(self.episode.pictures(camera, next(iter(self.episode.files(camera)))))
         return first.shape[1], first.shape[0]
 
     def about(self) -> dict[str, Any]:
