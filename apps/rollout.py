@@ -10,13 +10,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import queue
-import subprocess
 import sys
-import threading
 import time
 import traceback
-from collections import Counter, deque
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Literal
 
 import hal
@@ -57,8 +54,6 @@ LEROBOT = "lerobot:"
 """Begins a policy that is the checkpoint of one that LeRobot trained."""
 LOAD_TIMEOUT = 300.0
 """Longest time that such a policy may take to load, s."""
-PRINTED_LINES = 20
-"""Number of lines of such a server that are part of an error."""
 RECONNECT_TIMEOUT = 60.0
 """Longest wait between two episodes for a policy's server that was lost, s."""
 RECONNECT_PERIOD = 0.5
@@ -180,6 +175,7 @@ def is_remote(policy: str) -> bool:
 @contextlib.contextmanager
 def _policy(rig: Rig, robot: Robot, args: argparse.Namespace, config: PolicyConfig | None) -> Iterator[Policy]:
     """Yield the policy of ``--policy``."""
+    from hal.host.process import Child
     from hal.learning.asynchronous import RemotePolicy
     from hal.learning.policy import load_policy
     from hal.learning.remote import PolicyClient
@@ -190,54 +186,13 @@ def _policy(rig: Rig, robot: Robot, args: argparse.Namespace, config: PolicyConf
     with contextlib.ExitStack() as stack:
         url = args.policy
         if url.startswith(LEROBOT):
-            url = stack.enter_context(_lerobot_server(url.removeprefix(LEROBOT)))
+            given = {"checkpoint": url.removeprefix(LEROBOT)}
+            child = Child("policy", "hal.apps.serve_lerobot:serve_checkpoint", given)
+            stack.callback(child.close)
+            url = child.wait_ready(LOAD_TIMEOUT)
         client = PolicyClient(url, api_key=os.environ.get("HAL_POLICY_KEY", ""))
         stack.callback(client.close)
         yield RemotePolicy(rig, client, config, robot=robot, task=args.task, latency=args.latency)
-
-
-@contextlib.contextmanager
-def _lerobot_server(checkpoint: str) -> Iterator[str]:
-    """Start ``hal serve-lerobot`` in a process of its own, which ends with this one; yield its address."""
-    command = [sys.executable, "-m", "hal.apps.serve_lerobot", checkpoint, "--port", "0", "--until-stdin-ends"]
-    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    with subprocess.Popen(command, text=True, errors="replace", **pipes) as server:
-        assert server.stdin is not None
-        printed: deque[str] = deque(maxlen=PRINTED_LINES)
-        address: queue.SimpleQueue[str] = queue.SimpleQueue()
-        reader = threading.Thread(target=_read_server, args=(server.stdout, printed, address), daemon=True)
-        reader.start()
-        try:
-            try:
-                url = address.get(timeout=LOAD_TIMEOUT)
-            except queue.Empty:
-                url, trouble = "", f"was not loaded within {LOAD_TIMEOUT:g} s"
-            else:
-                trouble = "was not loaded"
-            if not url:
-                text = "".join(printed).rstrip() or "nothing"
-                raise PolicyError(f"the policy {checkpoint} {trouble}; it printed:\n{text}", code="policy_unreachable")
-            yield url
-        finally:
-            server.stdin.close()
-            try:
-                server.wait(5.0)
-            except subprocess.TimeoutExpired:
-                server.kill()
-            reader.join(1.0)
-
-
-def _read_server(lines: Any, printed: deque[str], address: queue.SimpleQueue[str]) -> None:
-    """Read what a policy's server prints until it ends, pass on its address, and show the rest."""
-    from hal.apps.serve_lerobot import LISTENING
-
-    for line in lines:
-        if line.startswith(LISTENING):
-            address.put(line.removeprefix(LISTENING).strip())
-        else:
-            printed.append(line)
-            sys.stderr.write(line)
-    address.put("")  # it ended
 
 
 def _recorder(rig: Rig, args: argparse.Namespace) -> Recorder | None:

@@ -10,26 +10,26 @@ pip install --no-deps robot-hal && pip install aiohttp msgpack
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import sys
-import threading
 from collections.abc import Collection, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hal.apps._common import program
 from hal.errors import CommandError, DriverMissing
 
+if TYPE_CHECKING:
+    from hal.host.process import Channel
+    from hal.learning.remote import PolicyServer
+
 STATE, IMAGES, ACTION = "observation.state", "observation.images.", "action"
 ENVIRONMENT = "observation.environment_state"
 GRIPPER = "gripper"
-LISTENING = "listening at "
-"""Begins the line with the server's address, which ``apps/rollout.py`` reads."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -56,19 +56,33 @@ def parser() -> argparse.ArgumentParser:
         help="address to listen at (%(default)s); every other needs certificates: hal keys",
     )
     made.add_argument("--port", type=int, default=8000, help="port; 0 for a free one (%(default)s)")
-    made.add_argument("--until-stdin-ends", action="store_true", help="end when standard input is closed")
     return made
 
 
 @program(parser)
 def main(args: argparse.Namespace) -> int:
     """Run the program; return the exit status."""
+    with _make_server(args) as server:
+        print(f"listening at {server.url}", flush=True)
+        server.wait()
+    return 0
+
+
+def serve_checkpoint(channel: Channel, memories: object, config: dict[str, Any]) -> None:
+    """Serve a checkpoint in a child of ``hal rollout``, which gets the address, until that ends."""
+    from hal.host.process import serve
+
+    with _make_server(parser().parse_args([config["checkpoint"], "--port", "0"])) as server:
+        channel.send({"ready": server.url})
+        serve(channel, {})
+
+
+def _make_server(args: argparse.Namespace) -> PolicyServer:
+    """Return the server that the options describe, with its policy loaded."""
     from hal.keys import Credentials, needs_keys
     from hal.learning.remote import PolicyServer
 
     keys = Credentials("host") if needs_keys(args.host) else None
-    if args.until_stdin_ends:
-        threading.Thread(target=_end_with_stdin, daemon=True).start()
     checkpoint = Path(args.checkpoint).expanduser()
     if not (checkpoint / "config.json").is_file():
         raise CommandError(f"{checkpoint} has no config.json: pass the folder pretrained_model of a checkpoint")
@@ -77,20 +91,9 @@ def main(args: argparse.Namespace) -> int:
     metadata = describe(info, policy.inputs)
     if policy.rtc_delay:
         metadata["rtc_max_delay_steps"] = policy.rtc_delay
+    print(f"{policy.kind} for {', '.join(metadata['joints'])} at {metadata['policy_config']['rate_hz']} Hz")
     where: dict[str, Any] = {"host": args.host, "port": args.port, "credentials": keys}
-    with PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, **where) as server:
-        print(f"{policy.kind} for {', '.join(metadata['joints'])} at {metadata['policy_config']['rate_hz']} Hz")
-        print(f"{LISTENING}{server.url}", flush=True)
-        server.wait()
-    return 0
-
-
-def _end_with_stdin() -> None:
-    """End this process when standard input is closed, also while it loads a policy or computes."""
-    with contextlib.suppress(OSError):
-        while os.read(0, 1024):  # not through sys.stdin, whose lock would abort an interpreter that ends meanwhile
-            pass
-    os._exit(0)
+    return PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, **where)
 
 
 def _dataset_info(checkpoint: Path, dataset: str | None) -> dict[str, Any]:

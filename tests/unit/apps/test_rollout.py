@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -364,40 +363,26 @@ arms:
     assert [name for name, far in zip(names, moved, strict=True) if far] == [names[0], names[8]]
 
 
-@pytest.mark.parametrize("hangs", [True, False])
 def test_a_checkpoint_that_is_not_loaded_is_an_error_with_what_its_server_printed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, hangs: bool
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = folder / "server.sh"
-    server.write_text(f"#!/bin/sh\necho $$ > pid\necho no such weights >&2\n{'cat > nothing' if hangs else 'exit 1'}\n")
+    server.write_text("#!/bin/sh\necho $$ > pid\necho no such weights >&2\nexit 1\n")
     server.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(server))
-    monkeypatch.setattr("hal.apps.rollout.LOAD_TIMEOUT", 0.5 if hangs else 20.0)
     pytest.importorskip("msgpack")
     done = rollout("--policy", "lerobot:checkpoint", *FAST)
     assert done.returncode == 2, done.stderr
-    assert done.stderr.count("no such weights") == 2, "as it was printed, and in the error"
+    assert "no such weights" in done.stderr
     with pytest.raises(ProcessLookupError):
         os.kill(int((folder / "pid").read_text()), 0)
 
 
-def test_a_server_of_a_checkpoint_ends_with_its_standard_input(folder: Path) -> None:
-    command = [sys.executable, "-c", "from hal.apps.serve_lerobot import _end_with_stdin as end; end(); print('here')"]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=60.0)
-    assert (done.returncode, done.stdout) == (0, b"")
-
-
-def test_a_server_that_fails_while_its_standard_input_is_open_ends_in_peace() -> None:
-    lines = (
-        "import threading, time; from hal.apps.serve_lerobot import _end_with_stdin as end",
-        "threading.Thread(target=end, daemon=True).start(); time.sleep(0.1)",
-    )
-    stdin, held_open = os.pipe()
-    try:
-        done = subprocess.run([sys.executable, "-c", "\n".join(lines)], stdin=stdin, capture_output=True, timeout=60.0)
-    finally:
-        os.close(stdin), os.close(held_open)
-    assert (done.returncode, done.stderr) == (0, b"")
+def test_a_folder_that_is_no_checkpoint_is_named_by_its_own_process(folder: Path) -> None:
+    pytest.importorskip("msgpack")
+    done = rollout("--policy", "lerobot:checkpoint", *FAST)
+    assert done.returncode == 2, done.stderr
+    assert "checkpoint has no config.json" in done.stderr
 
 
 def test_a_dry_run_opens_nothing(folder: Path) -> None:
