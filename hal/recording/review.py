@@ -157,7 +157,7 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
     """Read every row of these episodes, or of all, and return their statistics. Pictures are counted, not decoded."""
     lines: list[EpisodeSummary] = []
     broken: list[str] = []
-    times: dict[str, _Times] = {}
+    times: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
     for episode in dataset.episodes if episodes is None else episodes:
         try:
             line, stamps = measure_episode(episode), episode.stamps
@@ -167,7 +167,7 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
         lines.append(line)
         for source, stamp in stamps.items():
             if source.startswith(_WATCHED):
-                times.setdefault(source, _Times()).add(stamp, stamps["grid"])
+                times.setdefault(source, []).append((stamp, stamps["grid"]))
     return DatasetSummary(
         path=str(dataset.root),
         fps=dataset.fps,
@@ -180,7 +180,7 @@ def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Da
         unmarked=sum(line.success is None for line in lines),
         dropped=sum(line.dropped for line in lines),
         bytes=count_bytes(dataset.root),
-        timing=[found.timing(source) for source, found in times.items()],
+        timing=[_measure_timing(source, parts) for source, parts in times.items()],
         broken=broken,
     )
 
@@ -221,26 +221,13 @@ def _measure_motion(content: EpisodeContent) -> tuple[float, float]:
     return jerk, float(np.mean(fastest <= _IDLE)) if fastest.size else 1.0
 
 
-class _Times:
-    """Times of one source."""
-
-    def __init__(self) -> None:
-        self._periods: list[NDArray[np.float64]] = []
-        self._ages: list[NDArray[np.float64]] = []
-        self._repeated = 0
-
-    def add(self, stamps: NDArray[np.float64], grid: NDArray[np.float64]) -> None:
-        known = np.isfinite(stamps)
-        steps = np.diff(stamps[known])
-        self._repeated += int(np.sum(steps == 0.0))
-        self._periods.append(steps[steps != 0.0])
-        self._ages.append((grid - stamps)[known])
-
-    def timing(self, source: str) -> SourceTiming:
-        periods, ages = np.concatenate(self._periods) * 1e3, np.concatenate(self._ages) * 1e3
-        longest, period, jitter = _measure(periods)
-        oldest, age, _ = _measure(ages)
-        return SourceTiming(source, period, jitter, longest, age, oldest, self._repeated)
+def _measure_timing(source: str, parts: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> SourceTiming:
+    """Return the regularity of a source from its times, and when its rows were due, in each episode."""
+    steps = np.concatenate([np.diff(stamps[np.isfinite(stamps)]) for stamps, _ in parts])
+    ages = np.concatenate([(grid - stamps)[np.isfinite(stamps)] for stamps, grid in parts])
+    longest, period, jitter = _measure(1e3 * steps[steps != 0.0])
+    oldest, age, _ = _measure(1e3 * ages)
+    return SourceTiming(source, period, jitter, longest, age, oldest, int(np.sum(steps == 0.0)))
 
 
 def _measure(values: NDArray[np.float64]) -> tuple[float, float, float]:
