@@ -247,10 +247,10 @@ class Recorder:
                 self._episode = begun["episode"]
                 self._sampler.source = self.source
                 episode = EpisodeRecorder(self.rig, self.fps, self._sampler, self._buffers, self._queue, self._child)
-                episode.start()
+                episode.clock.start()
             except BaseException:
                 if episode is not None:
-                    episode.stop()
+                    episode.clock.stop()
                 self._stop_cameras()
                 raise
             self._current, self._is_open = episode, True
@@ -307,7 +307,7 @@ class Recorder:
         try:
             if success is not None:
                 write_mark(partial, success)
-            episode.stop()
+            episode.clock.stop()
             self._stop_cameras()
             if self._child.request("save", {"closing": episode.final_metadata(success, result)}, _SAVING) is None:
                 why = episode.dropped.why or "it ended at once"
@@ -319,7 +319,7 @@ class Recorder:
     def discard(self) -> None:
         """End the episode and delete it. Raises CommandError if none is open (code ``no_episode``)."""
         with self._lock:
-            self._end().stop()
+            self._end().clock.stop()
             self._stop_cameras()
             try:
                 self._child.request("discard", {}, _SAVING)
@@ -335,7 +335,7 @@ class Recorder:
             raise CommandError("no episode is being recorded: call start first", code="no_episode")
         self._is_open = False
         self._sampler.mark_arms(False)
-        self._current.end()
+        self._current.clock.end()
         return self._current
 
     def _stop_cameras(self) -> None:
@@ -363,7 +363,7 @@ class Recorder:
 
 
 class EpisodeRecorder:
-    """Makes the rows of one episode, from :meth:`start` to :meth:`end`."""
+    """Makes the rows of one episode, while :attr:`clock` asks for them."""
 
     def __init__(
         self, rig: Rig, fps: int, sampler: RowSampler, buffers: Sequence[CameraBuffer], queue: RowQueue, child: Child
@@ -384,18 +384,6 @@ class EpisodeRecorder:
         self._child = child
         clock = LockStepSampleClock if rig.lock_step else RealTimeSampleClock
         self.clock: SampleClock = clock(rig.clock, fps, self._read, self._make)
-
-    def start(self) -> None:
-        """Record the first row, of the present time, and start the clock."""
-        self.clock.start()
-
-    def end(self) -> None:
-        """Stop reading; rows that are due are still made. Idempotent."""
-        self.clock.end()
-
-    def stop(self) -> None:
-        """Stop reading, and block until the writer has received every row."""
-        self.clock.stop()
 
     def final_metadata(self, success: bool | None, result: Mapping[str, Any] | None) -> dict[str, Any]:
         """Return the metadata that is known at the end of the episode."""
