@@ -204,7 +204,7 @@ class EpisodeWorker:
             if not is_made_with_rig(self._functions["policy"]):
                 self._policy = policy
         runner = PolicyRunner(
-            rig, policy, robot=robot, rate_hz=r.rate_hz, seconds=r.seconds, history=r.history, success=judge
+            rig, policy, robots=[robot], rate_hz=r.rate_hz, seconds=r.seconds, history=r.history, success=judge
         )
         outcome = runner.run(seed)
         reason = _trace(outcome.error) if outcome.ended == "error" and outcome.error else outcome.reason

@@ -189,7 +189,6 @@ class PolicyRunner:
         rig: Rig,
         policy: Policy,
         *,
-        robot: Robot | None = None,
         robots: Collection[Robot] | None = None,
         rate_hz: float = 20.0,
         seconds: float = 30.0,
@@ -207,9 +206,8 @@ class PolicyRunner:
         Args:
             rig: An open rig.
             policy: The policy.
-            robot: The arm; None for the rig's first.
-            robots: Arms that the policy moves, in place of ``robot``; it then answers with a map of their names. A
-                stop of one ends the episode for all.
+            robots: Arms that the policy moves; None for the rig's first. For several it answers with a map of their
+                names, and a stop of one ends the episode for all.
             rate_hz: Turns per second.
             seconds: Longest time of an episode, without pauses, s.
             deadman: Dead-man; something that really moves needs it, or ``unattended``.
@@ -228,8 +226,7 @@ class PolicyRunner:
         if not seconds > 0.0:
             raise CommandError(f"an episode's seconds must be positive, not {seconds:g}")
         self.rig, self.policy = rig, policy
-        first = next(iter(rig.robots.values())) if robot is None else robot
-        self.robots = {arm.name: arm for arm in ([first] if robots is None else robots)}
+        self.robots = {arm.name: arm for arm in ([*rig.robots.values()][:1] if robots is None else robots)}
         if not self.robots:
             raise CommandError("a policy moves at least one arm", code="no_robot")
         if takeover is not None and takeover.teleop.robot.name not in self.robots:

@@ -176,6 +176,6 @@ def test_the_other_arm_rests_in_a_takeover_and_both_pause_with_the_dead_man() ->
             PolicyRunner(
                 rig,
                 lambda observation: SWING,
-                robot=rig.robots["right"],
+                robots=[rig.robots["right"]],
                 takeover=Takeover(hal.Teleop(rig.robots["left"]), rig.gamepads["pad"]),
             )
