@@ -97,10 +97,13 @@ class RecordedTrajectory:
         later = np.append(True, np.diff(np.maximum.accumulate(t)) > 0.0)
 
         def select(values: NDArray[Any]) -> Array:
-            return np.asarray(values, float)[later]
+            found: Array = np.asarray(values, float)[later]
+            return found
 
         width, target = content.width(arm), content.width(arm, SETPOINT)
-        force = content.width(arm, GRIP_FORCE) if content.has(GRIP_FORCE) else np.full(len(t), np.nan)
+        force = content.width(arm, GRIP_FORCE) if content.has(GRIP_FORCE) else None
+        if force is None:
+            force = np.full(len(t), np.nan)
         return cls(
             joints=tuple(content.joints(arm)),
             model=_model(episode.info, arm.name),

@@ -211,7 +211,7 @@ def _surface(shape: str, size: tuple[float, ...], file: str = "") -> Array:
     makers: dict[str, Callable[[], Any]] = {
         "box": lambda: creation.box(size),
         "sphere": lambda: creation.icosphere(radius=size[0]),
-        "cylinder": lambda: creation.cylinder(*size),
+        "cylinder": lambda: creation.cylinder(size[0], size[1]),
         "capsule": lambda: creation.capsule(size[1], size[0], count=[16, 16]),
     }
     if shape not in makers:
