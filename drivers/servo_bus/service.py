@@ -75,8 +75,8 @@ class MotorService:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(ConnectionLost):
-            for id, calibration in self._before.items():  # what was begun did not come to its end
+        for id, calibration in self._before.items():  # what was begun did not come to its end
+            with suppress(ConnectionLost):  # one that does not answer keeps no other from its calibration
                 self._write(id, calibration)
         self.bus.release(())
 
@@ -205,7 +205,8 @@ class MotorService:
     def _write(self, id: int, calibration: Calibration) -> None:
         self._unlock(id, True)
         address, mode = self.protocol.free
-        for place, data in ((address, bytes((mode,))), *self.protocol.store_calibration(calibration)):
+        rest = (self.protocol.delay_address, b"\0"), *self.protocol.store_calibration(calibration)
+        for place, data in ((address, bytes((mode,))), *rest):
             self._store(id, place, data)
         self._unlock(id, False)
 

@@ -132,3 +132,17 @@ def test_a_motor_that_was_not_moved_is_named_and_all_keep_their_calibration(
     assert all(f"{name}: was moved through 0.00 rad" in told for name in (far.spec.joints[1], "gripper"))
     assert stored() == before
     assert not list(tmp_path.iterdir())
+
+
+def test_a_motor_that_falls_silent_keeps_no_other_from_its_calibration(
+    far: SteppedServos, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    servos = far.arm.servos
+    before = [servo.decode().calibration for servo in servos]
+    for servo in servos:
+        servo.put(far.arm.protocol.delay_address, 250)
+    answer(monkeypatch, lambda: None, lambda: far.execute(f"silent {servos[-1].id} on"))
+    assert calibrate.main(["arm", *options(far, "--out", str(tmp_path / "arm.json"))]) == 2
+    assert "gripper" in capsys.readouterr().err
+    assert [servo.decode().calibration for servo in servos[:-1]] == before[:-1]
+    assert {servo.decode().return_delay for servo in servos} == {0}, "as hal check promises"
