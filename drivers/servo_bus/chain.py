@@ -165,7 +165,7 @@ class Chain:
             yield f"is of the model {found.number}, {kind}", "wrong_model"
             return
         if found.wrong:
-            yield f"{found.wrong}; calibrate it: hal calibrate arm", "wrong_mode"
+            yield found.wrong, "wrong_mode"
         if found.follows in self.ids and found.follows != joint.ids[0]:
             yield f"follows the motor {found.follows}, too: its secondary id; set it to 255", "wrong_mode"
         stored = found.calibration

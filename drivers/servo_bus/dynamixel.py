@@ -133,9 +133,11 @@ class Dynamixel(ServoProtocol):
         name, nominal, torque, rpm = MODELS.get(number, ServoModel("", 12.0, 1.0, 60))
         wrong = ""
         if mode not in (SINGLE, MULTI, CURRENT):
-            wrong = f"is in the operating mode {mode}, not in one for positions ({SINGLE}, {MULTI} or {CURRENT})"
+            wrong = f"is in the operating mode {mode}, not in one for positions ({SINGLE}, {MULTI} or {CURRENT}); "
+            wrong += "calibrate it: hal calibrate arm"
         elif drive & 0x0A:
-            wrong = f"has the drive mode {drive}: it is driven by another motor's cable, or switched on by a goal"
+            wrong = f"has the drive mode {drive}: it is driven by another motor's cable, or switched on by a goal; "
+            wrong += f"set it to {drive & ~0x0A} (address 10) with Dynamixel Wizard"
         # The error in counts times the gain over 128 is the duty cycle, of which `full` gives the stall torque.
         stiffness = torque / self.full * max(1, gain) / 128 / COUNT
         calibration = Calibration(drive & 1, offset, low, high)

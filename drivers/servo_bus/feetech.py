@@ -88,7 +88,9 @@ class Feetech(ServoProtocol):
     def decode_registers(self, data: bytes) -> Registers:
         number, low, high, voltage_max, limit, offset = struct.unpack("<3x H 4x HH x B x H 13x H 7x", data)
         nominal = 12.0 if voltage_max > 100 else 7.4  # its greatest voltage tells the two kinds apart
-        wrong = "is not set to positions within one turn" if data[33] != 0 or data[18] & 0x10 else ""
+        wrong = "is not set to positions; calibrate it: hal calibrate arm" if data[33] != 0 else ""
+        if data[18] & 0x10:  # no calibration changes that
+            wrong = "is not set to positions within one turn; clear bit 4 of its phase (address 18) with Feetech's tool"
         model, stiffness = "STS3215" if number == MODEL else "", STIFFNESS * max(1, data[21])
         calibration, torque = Calibration(0, signed(offset, 11), low, high), STALL_TORQUES[nominal]
         return Registers(model, number, data[7], calibration, nominal, torque, 4.7, stiffness, limit, wrong, turns=0)

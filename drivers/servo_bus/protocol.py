@@ -86,7 +86,7 @@ class Registers(NamedTuple):
     limit_max: int
     """Greatest torque limit, in :attr:`ServoProtocol.full`."""
     wrong: str = ""
-    """Why it can not be used as it is set; empty if it can."""
+    """Why it can not be used as it is set, and what to do; empty if it can."""
     turns: int = 1
     """0: it reports one turn only; 1: it counts turns while its torque is off; 2: always, until it loses its power."""
     follows: int = 255
