@@ -27,6 +27,9 @@ def open_line(path: str, baud: int) -> int:
         path: Its device.
         baud: Bit/s, one of those that ``termios`` has.
     """
+    if path.endswith(EMULATED) and os.stat(path).st_ctime > os.lstat(path).st_mtime:
+        # A killed emulator has left its link, which now leads to a younger terminal, of someone else.
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
     line = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         fcntl.ioctl(line, termios.TIOCEXCL)  # a second program would take half of the answers
@@ -60,6 +63,8 @@ def read_line(line: int) -> bytes:
 def explain(error: OSError, more: Mapping[int, str] | None = None) -> str:
     """Return why a line does not work, with what to do about it; ``more`` is further advice, by error number."""
     there = ", ".join(map(str, Path("/dev/serial/by-id").glob("*"))) or "none"
+    if error.errno == errno.ENOENT and str(error.filename).endswith(EMULATED):
+        return "its emulator does not run; start it in another terminal: hal emulate --config RIG"
     advice = {**_ADVICE, **(more or {})}.get(error.errno or 0, "check its cable and its power")
     return f"{error.strerror}; {advice}{there if error.errno == errno.ENOENT else ''}"
 
