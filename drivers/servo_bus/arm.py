@@ -169,12 +169,20 @@ class ServoArm(RobotDriver):
                 self._fault = fault
                 self.faults += 1
                 self._disengage()
-                # Joints that are away from their goals stay where they are: they neither push on nor leap.
-                goals = [s.position if abs(s.goal - s.position) * COUNT > _AWAY else s.goal for s in states]
-                self.chain.write_goals(self._clip(goals))
             elif any(state.stopped for state in states):  # this process was frozen: they are switched on anew
                 self._disengage()
+        if self._fault is not None:
+            self._stay(states)
         return self._fault or fault
+
+    def _stay(self, states: Sequence[MotorState]) -> None:
+        """Let joints that are away from their goals stay where they are, so that they neither push on nor leap.
+
+        Also those that have fallen: a Feetech motor has its torque back by itself, once it is cool or has its supply.
+        """
+        if any(abs(s.goal - s.position) * COUNT > _AWAY for s in states):
+            goals = [s.position if abs(s.goal - s.position) * COUNT > _AWAY else s.goal for s in states]
+            self.chain.write_goals(self._clip(goals))
 
     def _find_off(self, states: Sequence[MotorState]) -> list[str]:
         return [label for label, state in zip(self.chain.labels, states, strict=True) if not state.on]
