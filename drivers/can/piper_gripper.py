@@ -5,7 +5,9 @@ from __future__ import annotations
 from math import inf
 
 from hal.driver import GripperDriver, GripperReading
+from hal.errors import Fault
 from hal.specs import GripperSpec
+from hal.types import GripperOutcome
 
 from .piper_link import FRESH_READS, SILENCE, PiperLink, gripper_fault
 from .piper_protocol import ENABLED, GRIPPER_IDS, GripperRequest, GripperStatus, PiperFeedback
@@ -19,6 +21,13 @@ _BLOCKED, _PRESSING = 0.05, 0.5
 """Fingers press on something that have not moved for so long, s, with this share of the commanded torque."""
 _LARGEST_TORQUE = 5.0
 """Nm."""
+_CLEARED = 0.05
+"""Time after a command in which the gripper may still report what that clears, s."""
+_OFF = Fault(
+    "switched_off",
+    "the gripper went off: what it held may be loose",
+    "check the arm's power supply; give the command again",
+)
 
 
 class PiperGripper(GripperDriver):
@@ -49,6 +58,10 @@ class PiperGripper(GripperDriver):
         self._speed = 0.0
         self._torque = 0.0
         self._stopped = True
+        self._was_on = False
+        """Whether the gripper has been on since the newest command."""
+        self._t_command = -inf
+        """When that was given, s."""
         self._t_moved = self._t_still = -inf
         """Last time at which the fingers moved, or should have, s; and since when they have not moved."""
         self._still_at = 0.0
@@ -74,7 +87,7 @@ class PiperGripper(GripperDriver):
             self._stopped = True
             raise self._link.lose(f"the gripper has sent nothing for {1e3 * SILENCE:.0f} ms")
         self._link.lost = None
-        fault = gripper_fault(status)
+        fault = self._find_fault(status)
         if fault is not None:
             self._stopped = True
         if abs(status.width - self._still_at) > _STILL:
@@ -91,8 +104,18 @@ class PiperGripper(GripperDriver):
             moving=moving,
             grasped=self._target is not None and not moving and not self._stopped and blocked,
             force=abs(status.torque) * self.settings.force_per_torque,
-            fault=fault if self._target is not None else None,
+            outcome=None if fault is None else GripperOutcome.FAILED,
+            fault=fault,
         )
+
+    def _find_fault(self, status: GripperStatus) -> Fault | None:
+        """Return why the newest command failed; None before the first one."""
+        if self._t_status <= self._t_command + _CLEARED:
+            return None
+        on = bool(status.flags & ENABLED)
+        off = _OFF if self._was_on and not on else None
+        self._was_on |= on and self._target is not None
+        return (gripper_fault(status) if self._target is not None else None) or off
 
     def _advance(self, dt: float) -> None:
         """Move the target along at the speed of the command, and send it."""
@@ -125,8 +148,8 @@ class PiperGripper(GripperDriver):
             self._ramp = min(max(self._ramp, present), self._goal)
         self._speed = min(speed, self.spec.speed)
         self._torque = min(max(force / self.settings.force_per_torque, 0.0), _LARGEST_TORQUE)
-        self._stopped = False
-        self._t_moved = self._now
+        self._stopped = self._was_on = False
+        self._t_moved = self._t_command = self._now
         self._send(self._ramp, clear=gripper_fault(status) is not None)
 
     def stop(self) -> None:

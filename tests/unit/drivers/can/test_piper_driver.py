@@ -14,6 +14,7 @@ from hal.drivers.can import piper_protocol as protocol
 from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
 from hal.errors import ConnectionLost, DeviceNotFound, RobotFault
+from hal.types import GripperOutcome
 from hal_emulators.can.piper_frames import EmergencyRequest, decode_command, encode_report
 
 DT = 0.005
@@ -358,4 +359,12 @@ def test_a_grippers_error_fails_its_command_and_the_next_one_clears_it(bench: Be
     gripper.move(0.03, 0.1, 20.0)
     assert run(1.0) == pytest.approx(0.03, abs=1e-3)
     assert gripper.read(bench.now).fault is None
+    bench.far.execute("power")
+    run(0.1)
+    reading = gripper.read(bench.now)
+    assert reading.fault is not None
+    assert (reading.fault.code, reading.outcome, reading.grasped) == ("switched_off", GripperOutcome.FAILED, False)
+    gripper.move(0.05, 0.1, 20.0)
+    assert run(1.0) == pytest.approx(0.05, abs=1e-3)
+    assert gripper.read(bench.now).outcome is None
     gripper.close()
