@@ -10,6 +10,7 @@ import numpy as np
 from hal.driver import GripperDriver, GripperReading
 from hal.errors import Fault
 from hal.specs import GripperSpec
+from hal.types import GripperOutcome
 
 from .chain import Chain, Joint
 from .protocol import COUNT, MotorState
@@ -23,13 +24,15 @@ _TOLERANCE = 0.003
 """Largest distance from the target width at which the jaw counts as arrived, m."""
 _LEAST_TORQUE = 0.1
 """Least torque limit, share of the stall torque, so that the jaw overcomes its own friction: chosen."""
+_LOST = Fault("lost", "the connection was lost before the jaw was there", "give the command again")
 
 
 class ServoGripper(GripperDriver):
     """A gripper on a servo bus (settings: :class:`~.settings.ServoGripperSettings`).
 
     The goal runs along at the speed of the command; the force of the command is the motor's torque limit. The motor
-    holds its last goal for ever, with that limit.
+    holds its last goal for ever, with that limit. A command begins with a restart of a motor whose error has switched
+    it off, as a Dynamixel motor's does. Nothing goes on by itself after a fault, or a loss of the connection.
     """
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
@@ -51,6 +54,10 @@ class ServoGripper(GripperDriver):
         """Width that the motor was sent last, m; None until it holds."""
         self._goal = self._speed = 0.0
         """Width at which the ramp ends, m, and its speed, m/s."""
+        self._was_on = False
+        """Whether the motor has had its torque since it was switched on."""
+        self._t_restarted = -inf
+        """When the motor was last told to restart, s."""
         self._limit = 0
         """Torque limit of the command."""
         self._fault: Fault | None = None
@@ -90,7 +97,8 @@ class ServoGripper(GripperDriver):
         try:
             (state,) = self.chain.read(now)
         except BaseException:
-            self._ramp = None
+            if self._is_driven and self._ramp != self._goal and now - self._t_restarted > self.protocol.restart:
+                self._fail(_LOST)
             raise
         self._state = state
         if state.t > self._t:
@@ -98,14 +106,13 @@ class ServoGripper(GripperDriver):
         width = self._width(state.position)
         if abs(width - self._still_at) > _STILL:
             self._still_at, self._t_moved = width, now
-        fault = self.chain.fault([state])
-        if self._target is not None and self._fault is None:
+        if self._is_driven and state.t > self._t_restarted:
+            fault = self._find_fault(state)
             if fault is not None and self._ramp is not None:
-                self._fault, self._goal = fault, self._ramp
+                self._fail(fault)
             else:
                 self._drive(state, width, dt)
-        driven = self._target is not None and self._fault is None
-        moving = driven and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
+        moving = self._is_driven and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
         torque = abs(state.load) / self.protocol.full * self.chain.registers[0].stall_torque if state.on else 0.0
         blocked = width - self._goal > _TOLERANCE
         return GripperReading(
@@ -117,8 +124,26 @@ class ServoGripper(GripperDriver):
             moving=moving,
             grasped=self._target is not None and self._ramp is not None and not moving and blocked,
             force=torque / self._lever(width),
+            outcome=None if self._fault is None else GripperOutcome.FAILED,
             fault=self._fault,
         )
+
+    @property
+    def _is_driven(self) -> bool:
+        return self._target is not None and self._fault is None
+
+    def _find_fault(self, state: MotorState) -> Fault | None:
+        fault = self.chain.fault([state])
+        if fault is None and self._was_on and not state.on:
+            cause = f"{self.chain.labels[0]} went off: what it held may be loose"
+            fault = Fault("switched_off", cause, "check its power supply; give the command again")
+        self._was_on |= state.on
+        return fault
+
+    def _fail(self, fault: Fault) -> None:
+        """End the command; the motor keeps its goal."""
+        self._fault = fault
+        self._goal = self._goal if self._ramp is None else self._ramp
 
     def _drive(self, state: MotorState, width: float, dt: float) -> None:
         """Switch the motor on where it is, then move its goal along at the speed of the command."""
@@ -151,8 +176,12 @@ class ServoGripper(GripperDriver):
         self._speed = min(speed, self.spec.speed)
         share = max(force * self._lever(self._target) / registers.stall_torque, _LEAST_TORQUE)
         self._limit = round(min(self.protocol.full * share, registers.limit_max))
-        if self._fault is not None or state is None or not state.on or state.error:
-            self._ramp = None  # switching on again ends an overload
+        if state is None or not state.on or state.error:
+            self._ramp, self._was_on = None, False  # switching on again ends an overload
+            if state is not None and state.error and not state.on and state.t > self._t_restarted:
+                self._t_restarted = self._now
+                for frame in self.protocol.clear({self.settings.id: state}):
+                    self.chain.check().send(*frame)
         elif self._ramp is None:
             self._ramp = self._width(state.goal)
         if self._ramp is not None and state is not None and self._goal > self._ramp:
@@ -163,6 +192,8 @@ class ServoGripper(GripperDriver):
         """Keep the jaw where it is; an object that it holds stays held with the same torque."""
         self.chain.check()
         state, ramp = self._state, self._ramp
+        if ramp is None:  # it is not switched on any more
+            self._target = None
         if state is None or ramp is None or (ramp == self._goal and self._now - self._t_moved >= _AT_REST):
             return
         if abs(state.load) < 0.5 * self._limit:  # the goal is ahead of a slow jaw

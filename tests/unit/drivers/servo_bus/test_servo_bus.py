@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import termios
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
@@ -25,7 +27,10 @@ from hal.drivers.servo_bus.dynamixel import Dynamixel
 from hal.drivers.servo_bus.feetech import Feetech
 from hal.drivers.servo_bus.preflight import check
 from hal.drivers.servo_bus.protocol import signed
-from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, RobotFault
+from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, RobotFault
+from hal.testing import GripperBench
+from hal.testing.hosting import HostedGripper
+from hal.types import GripperOutcome
 
 
 class Arm:
@@ -206,6 +211,16 @@ def test_a_fault_is_named_stops_the_arm_and_is_over_after_recover(arm: Arm, comm
     arm.engage()
 
 
+@pytest.mark.parametrize("command", ["temperature 2 85", "voltage 2 3.5"])
+def test_a_joint_that_fell_does_not_leap_when_its_motor_has_its_torque_again(so101: Arm, command: str) -> None:
+    held = so101.engage().q[1]
+    so101.far.execute(command)
+    fallen = so101.run(0.6).q[1]
+    assert abs(fallen - held) > 0.2
+    so101.far.execute("reset")
+    assert abs(so101.run(1.0).q[1] - held) > 0.9 * abs(fallen - held)
+
+
 def test_two_motors_of_a_joint_that_disagree_are_named(viperx: Arm) -> None:
     viperx.engage()
     viperx.far.execute("register 3 20 -300")
@@ -349,6 +364,18 @@ def test_a_silent_motor_is_lost_after_a_tenth_of_a_second_and_comes_back(
     assert arm.driver.engaged
 
 
+def test_the_link_that_a_killed_emulator_left_leads_to_no_other_terminal(tmp_path: Path) -> None:
+    port, ends = tmp_path / "arm.emulated", os.openpty()
+    port.symlink_to(os.ttyname(ends[1]))
+    os.utime(port, (0.0, 0.0), follow_symlinks=False)  # older than the terminal
+    before = termios.tcgetattr(ends[1])
+    with pytest.raises(ConnectionLost, match="hal emulate"):
+        ServoBus.acquire(str(port), Feetech())
+    assert termios.tcgetattr(ends[1]) == before
+    for end in ends:
+        os.close(end)
+
+
 def test_an_arm_that_was_plugged_in_instead_is_not_driven(arm: Arm) -> None:
     arm.engage()
     arm.far.execute("unplug on")
@@ -411,3 +438,67 @@ def test_the_check_counts_motors_and_names_an_adapter_that_collects_answers(
         "it collects answers for 16 ms",
         f"echo 1 | sudo tee {timer}",
     )
+
+
+@contextmanager
+def hosted_jaw(rig: str) -> Iterator[tuple[SteppedServos, HostedGripper]]:
+    """The gripper of an arm, open, as an app sees it."""
+    with SteppedServos(rig) as far, closing(registry.load(far.spec.driver, "gripper")(far.spec.gripper)) as driver:
+        assert far.arm.jaw is not None
+        far.arm.jaw.q = far.arm.jaw.upper
+        far.arm.place(far.spec.initial)
+        with HostedGripper(GripperBench(driver=driver, dt=0.02, advance=lambda: far.advance(0.02))) as hosted:
+            yield far, hosted
+
+
+@pytest.mark.parametrize("command", ["error {id} 32", "temperature {id} 85", "power 0"])
+@pytest.mark.parametrize("rig", ["so101", "viperx"])
+def test_a_fault_of_the_jaw_fails_its_command_and_the_next_command_moves_it(rig: str, command: str) -> None:
+    with hosted_jaw(rig) as (far, hosted):
+        motion = hosted.gripper.start(0.0, speed=0.02)
+        hosted.run_for(0.3)
+        far.execute(command.format(id=far.arm.servos[-1].id))
+        result = motion.wait(1.0)
+        assert result.outcome is GripperOutcome.FAILED
+        assert result.fault is not None
+        assert result.fault.remedy
+        far.execute("reset")
+        at = hosted.run_for(0.1).width
+        assert hosted.run_for(0.5).width == pytest.approx(at, abs=1e-3), "nothing goes on by itself"
+        assert hosted.gripper.move(0.02).width == pytest.approx(0.02, abs=2e-3)
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 3])
+@pytest.mark.parametrize("rig", ["so101", "viperx"])
+def test_a_stop_before_the_motor_of_the_jaw_is_on_ends_the_command(rig: str, cycles: int) -> None:
+    with hosted_jaw(rig) as (_, hosted):
+        hosted.gripper.start(0.0)
+        at = hosted.run_for(0.02 * cycles).width
+        hosted.host.latch.stop()
+        assert hosted.run_for(1.0).width == pytest.approx(at, abs=3e-3)
+        hosted.host.latch.acknowledge(hosted.host.latch.stops)
+        assert hosted.gripper.move(0.02).width == pytest.approx(0.02, abs=2e-3)
+
+
+@pytest.mark.parametrize("rig", ["so101", "viperx"])
+def test_what_the_jaw_holds_stays_held_when_the_port_comes_back(rig: str) -> None:
+    with hosted_jaw(rig) as (far, hosted):
+        far.execute("object 0.03")
+        assert hosted.gripper.grasp(0.03)
+        assert far.arm.jaw is not None
+        pressed, least = abs(far.arm.jaw.tau), 1e9
+        far.execute("unplug on")
+        with pytest.raises(ConnectionLost):
+            hosted.run_for(1.0)
+        far.execute("unplug off")
+        deadline = monotonic() + 5.0
+        while hosted.gripper.peek().fault is not None:  # type: ignore[union-attr]
+            with suppress(HalError):
+                hosted.run_for(0.02)
+            least = min(least, abs(far.arm.jaw.tau))
+            assert monotonic() < deadline
+        for _ in range(20):
+            state = hosted.run_for(0.02)
+            least = min(least, abs(far.arm.jaw.tau))
+        assert least > 0.8 * pressed > 0.0
+        assert state.grasped
