@@ -97,8 +97,7 @@ class ServoGripper(GripperDriver):
         try:
             (state,) = self.chain.read(now)
         except BaseException:
-            if self._is_driven and self._ramp != self._goal and now - self._t_restarted > self.protocol.restart:
-                self._fail(_LOST)
+            self._note_loss()
             raise
         self._state = state
         if state.t > self._t:
@@ -106,12 +105,8 @@ class ServoGripper(GripperDriver):
         width = self._width(state.position)
         if abs(width - self._still_at) > _STILL:
             self._still_at, self._t_moved = width, now
-        if self._is_driven and state.t > self._t_restarted:
-            fault = self._find_fault(state)
-            if fault is not None and self._ramp is not None:
-                self._fail(fault)
-            else:
-                self._drive(state, width, dt)
+        if self._is_driven:
+            self._follow(state, width, dt)
         moving = self._is_driven and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
         torque = abs(state.load) / self.protocol.full * self.chain.registers[0].stall_torque if state.on else 0.0
         blocked = width - self._goal > _TOLERANCE
@@ -139,6 +134,21 @@ class ServoGripper(GripperDriver):
             fault = Fault("switched_off", cause, "check its power supply; give the command again")
         self._was_on |= state.on
         return fault
+
+    def _follow(self, state: MotorState, width: float, dt: float) -> None:
+        """Drive the jaw, unless the state is from before its motor's restart, or shows a fault."""
+        if state.t <= self._t_restarted:
+            return
+        fault = self._find_fault(state)
+        if fault is not None and self._ramp is not None:
+            self._fail(fault)
+        else:
+            self._drive(state, width, dt)
+
+    def _note_loss(self) -> None:
+        restarts = self._now - self._t_restarted <= self.protocol.restart
+        if self._is_driven and self._ramp != self._goal and not restarts:
+            self._fail(_LOST)
 
     def _fail(self, fault: Fault) -> None:
         """End the command; the motor keeps its goal."""
