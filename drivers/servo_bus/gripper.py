@@ -31,8 +31,8 @@ class ServoGripper(GripperDriver):
     """A gripper on a servo bus (settings: :class:`~.settings.ServoGripperSettings`).
 
     The goal runs along at the speed of the command; the force of the command is the motor's torque limit. The motor
-    holds its last goal for ever, with that limit. A command begins with a restart of a motor whose error has switched
-    it off, as a Dynamixel motor's does. Nothing goes on by itself after a fault, or a loss of the connection.
+    holds its last goal for ever, with that limit. A command begins with a restart of a motor that reports an error,
+    which a Dynamixel motor does until then. Nothing goes on by itself after a fault, or a loss of the connection.
     """
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
@@ -188,7 +188,7 @@ class ServoGripper(GripperDriver):
         self._limit = round(min(self.protocol.full * share, registers.limit_max))
         if state is None or not state.on or state.error:
             self._ramp, self._was_on = None, False  # switching on again ends an overload
-            if state is not None and state.error and not state.on and state.t > self._t_restarted:
+            if state is not None and state.error and state.t > self._t_restarted:
                 self._t_restarted = self._now
                 for frame in self.protocol.clear({self.settings.id: state}):
                     self.chain.check().send(*frame)

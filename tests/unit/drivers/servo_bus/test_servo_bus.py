@@ -451,7 +451,7 @@ def hosted_jaw(rig: str) -> Iterator[tuple[SteppedServos, HostedGripper]]:
             yield far, hosted
 
 
-@pytest.mark.parametrize("command", ["error {id} 32", "temperature {id} 85", "power 0"])
+@pytest.mark.parametrize("command", ["error {id} 32", "temperature {id} 85", "voltage {id} 3.5", "power 0"])
 @pytest.mark.parametrize("rig", ["so101", "viperx"])
 def test_a_fault_of_the_jaw_fails_its_command_and_the_next_command_moves_it(rig: str, command: str) -> None:
     with hosted_jaw(rig) as (far, hosted):
