@@ -69,7 +69,7 @@ async def test_too_many_messages_close_the_page_and_a_stop_among_them_counts(app
 async def test_a_page_that_leaves_loses_the_pad_at_once(app: App, how: str) -> None:
     async with Page(app) as page:
         await page.take()
-        await page.drive([0.0] * 4 + [1.0] + [0.0] * 3, 64)
+        await page.drive([0.0] * 4 + [1.0] + [0.0] * 11, 64)
         assert (await app.pad())["connected"]
         if how == "hidden":
             await page.say(type="away", why="hidden")
