@@ -62,7 +62,7 @@ def playback_pad() -> Iterator[PadBench]:
 def web_pad() -> Iterator[PadBench]:
     """The pad of a console page, which sends its state every 10 ms."""
     from hal.drivers.web.pad import PadQueue, WebPad, pad_reading
-    from hal.types import STICK_AXES
+    from hal.types import PAGE_AXES
 
     class Page:
         queue = PadQueue()
@@ -77,7 +77,7 @@ def web_pad() -> Iterator[PadBench]:
             """No recording is played here."""
 
         def speak(self) -> None:
-            now, axes = bench.now, [0.0] * len(STICK_AXES)
+            now, axes = bench.now, [0.0] * len(PAGE_AXES)
             message = {
                 "connected": self.there,
                 "t": now,

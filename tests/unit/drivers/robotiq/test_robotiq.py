@@ -360,8 +360,9 @@ def test_the_line_is_checked_before_it_is_opened() -> None:
 
 def test_a_missing_line_is_an_error_with_a_remedy(far: FarGripper) -> None:
     spec = far.driver.spec
-    for options, word in (({"port": "/no/such.emulated"}, "plug in"), ({"port": "/dev/null"}, "no serial line")):
-        driver = RobotiqGripper(replace(spec, options={"model": "2f85", **options}))
+    words = {"/no/such": "plug in", "/no/such.emulated": "hal emulate", "/dev/null": "no serial line"}
+    for port, word in words.items():
+        driver = RobotiqGripper(replace(spec, options={"model": "2f85", "port": port}))
         with pytest.raises(hal.ConnectionLost, match=word):
             driver.open()
 
