@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 
@@ -60,13 +61,12 @@ def test_a_link_with_another_token_shows_nothing(bench: Bench, page: Browser) ->
 @pytest.mark.slow
 def test_the_cameras_show_what_happens() -> None:
     need_browser()
-    bench, browser = Bench(cameras=True), Browser()
     picture = """const c = document.querySelector('[data-camera="scene"]');
         const data = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
         let sum = 0; for (let k = 0; k < data.length; k += 1) sum = (sum * 31 + data[k]) >>> 0;
         const values = new Set(); for (let k = 0; k < data.length; k += 4) values.add(data[k]);
         return [sum, values.size]"""
-    try:
+    with closing(Bench(cameras=True)) as bench, closing(Browser()) as browser:
         browser.open(bench.link)
         browser.wait_driving()
         wait_for(lambda: browser.run(picture)[1] > 50, "a picture with something in it")
@@ -81,9 +81,6 @@ def test_the_cameras_show_what_happens() -> None:
         assert "unknown" in browser.text(".camera.large .scale"), "its colours are explained"
         wait_for(lambda: browser.run(picture)[1] > 20, "colours of depth")
         assert browser.complaints() == []
-    finally:
-        browser.close()
-        bench.close()
 
 
 SIZES = [

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import closing
 
 import pytest
 
@@ -34,9 +35,8 @@ def test_a_held_dead_man_stays_held() -> None:
 
 def hold_and_drive() -> str | None:
     """Hold for so long, and drive to and fro. What the page says of its own standstill, if there was one."""
-    bench, browser = Bench(cameras=True), Browser()
     began = time.monotonic()
-    try:
+    with closing(Bench(cameras=True)) as bench, closing(Browser()) as browser:
         browser.open(bench.link)
         browser.wait_driving()
         wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad at rest")
@@ -62,6 +62,3 @@ def hold_and_drive() -> str | None:
         assert bench.app.display.report.trips == []
         assert moved > 0.03 * SECONDS, "the arm went to and fro"
         return None
-    finally:
-        browser.close()
-        bench.close()
