@@ -46,17 +46,17 @@ and makes every group wait for the slowest."""
 MEMORY = "/dev/shm"
 """Folder for files that stay in the computer's memory, where there is one."""
 SOLUTION: dict[str, dict[str, Any]] = {
-    "mirror": {"solverResidualThreshold": 1e-7, "numSolverIterations": 400},
     "fine": {"solverResidualThreshold": 1e-7, "numSolverIterations": 200},
     "coarse": {"solverResidualThreshold": 3e-6, "numSolverIterations": 100},
 }
 """The solver stops once no speed changes by more than the root of the residual in an iteration, m/s or rad/s (0.3 and
 1.7 mm/s), and after so many iterations at the latest.
 
-"mirror" is for worlds with the mirror of a real arm, which nothing stops: with 200 iterations one that pushes 50 kg is
-off by up to 2 mrad. "fine" is needed while fingers move slowly or hold something: with 100 iterations the six joints of
-a Robotiq 2F-85 press with 52 N of 60. With "coarse" a step takes less time, and an arm follows less exactly; with
-PyBullet's own 50 iterations fast arms exceed their speed limits a little."""
+"fine" is needed while fingers move slowly or hold something: with 100 iterations the six joints of a Robotiq 2F-85
+press with 52 N of 60. It is used with the mirror of a real arm, too, which nothing stops: one that pushes 50 kg is off
+by up to 2 mrad. With twice the iterations it is not, but then a slow computer falls behind an arm that holds something:
+a step takes up to 6 ms of 4. With "coarse" a step takes less time, and an arm follows less exactly; with PyBullet's own
+50 iterations fast arms exceed their speed limits a little."""
 
 
 LEAST_HZ = 100.0
@@ -168,7 +168,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
 
     def _set_solution(self) -> None:
         mirrors = any(robot.driver != self.spec.driver for robot in self.spec.robots)
-        kind = "mirror" if mirrors else "fine" if self._handling else "coarse"
+        kind = "fine" if mirrors or self._handling else "coarse"
         self.client.setPhysicsEngineParameter(**SOLUTION[kind])
 
     def load_body(self, spec: BodySpec | RobotSpec) -> Body:

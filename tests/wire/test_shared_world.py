@@ -68,7 +68,7 @@ class Bench:
         return ["--real", "--config", self.rig, *(word for value in self.overrides for word in ("--set", value))]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def fr3() -> Iterator[Bench]:
     host = free_host()
     sets = [*SCENE, f"robots.arm.real.host={host}", "robots.arm.gripper.enabled=true"]
@@ -78,7 +78,7 @@ def fr3() -> Iterator[Bench]:
         yield Bench("franka_emulator", sets)
 
 
-@pytest.fixture(scope="module", params=["yam_emulator", "piper_emulator"])
+@pytest.fixture(params=["yam_emulator", "piper_emulator"])
 def can(request: pytest.FixtureRequest) -> Iterator[Bench]:
     with EmulatorProcess(request.param, *SCENE) as emulator:
         yield Bench(request.param, emulator.overrides)
@@ -266,6 +266,8 @@ from hal.recording import Dataset
 EPISODE = Dataset("data").episodes[0]
 T = EPISODE.stamps["robot.arm"] - EPISODE.stamps["robot.arm"][0]
 ROWS = EPISODE.columns["rig.setpoint"]
+SPAN = np.arange(1, 31) / 20  # it holds the last row for a while: the world may be late
+T, ROWS = np.append(T, T[-1] + SPAN), np.append(ROWS, ROWS[-1:].repeat(30, 0), 0)
 PUT = EPISODE.columns["rig.object.cube"][-1, :3]
 
 

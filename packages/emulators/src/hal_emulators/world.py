@@ -46,6 +46,8 @@ _FINGER_SPEED = 3.0
 """The world's fingers may be so many times as fast as the emulated ones, so that they can follow."""
 _TOUCHED = 0.02
 """Time after the last contact until which it counts, s: contacts flicker."""
+_AT_ONCE = frozenset({"pose", "poses"})
+"""Requests that loops and recordings make at their rate: they get the state of the newest step, however late."""
 _OPPOSITE = -0.5
 """Greatest cosine between the two sides' normals of contact with an object between them."""
 
@@ -280,7 +282,8 @@ class WorldServer:
                     self._fingers_of[descriptor].take_fingers(message)
                 else:
                     request = message["id"], message["method"], message["params"]
-                    self._requests.append((self._reported(time.monotonic()), descriptor, *request))
+                    due = self._t if message["method"] in _AT_ONCE else self._reported(time.monotonic())
+                    self._requests.append((due, descriptor, *request))
         except ConnectionLost:
             self._drop(descriptor)
         except Exception:  # of what this client sent: the world goes on without it
@@ -297,7 +300,7 @@ class WorldServer:
         client.close()
 
     def _answer_due(self, t: float) -> None:
-        """Answer the requests that came before ``t``: a late world has caught up with what their clients knew."""
+        """Answer the requests for before ``t``: a late world has caught up with what clients knew at their edits."""
         while self._requests and self._requests[0][0] <= t:
             _, descriptor, number, method, params = self._requests.popleft()
             self._send(descriptor, self._answer(number, method, params))
