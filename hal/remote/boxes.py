@@ -103,6 +103,8 @@ class CommandBox(Box):
         super().__init__(mail.command, past=(self._SENT, self._EVENT))
         self._mail = mail
         self._most_ahead = most_ahead
+        self.on_the_way = 0.0
+        """Time that a command takes at least until it is here, s: it does not count against its deadline."""
 
     def read(self) -> bytes:
         """Return the newest command, with its chunk."""
@@ -129,6 +131,8 @@ class CommandBox(Box):
         if chunk and rest:
             self._mail.put_chunk(struct.unpack_from("<Q", rest)[0], array("d", bytes(rest[8:])))
         deadline = _time(record, self._DEADLINE) + shift
+        if not chunk:
+            deadline += self.on_the_way
         most = now + (CHUNK_AHEAD if chunk else self._most_ahead)
         _DOUBLE.pack_into(record, self._DEADLINE, min(deadline, most))
         super()._write(record, shift, now)

@@ -22,7 +22,7 @@ from ..host.records import GripperMail, RobotMail
 from ..host.scheduling import LINK_PRIORITY, raise_thread
 from ..servo.watchdog import SILENCE
 from ..specs import CameraSpec, PadSpec, Plan, RobotSpec, to_json
-from .boxes import boxes_of_hosts, boxes_of_program
+from .boxes import CommandBox, boxes_of_hosts, boxes_of_program
 from .entrance import Entrance
 from .frames import send_frames
 from .link import CLOSE_LIMIT, MOST_ROUND_TRIP, RigLink, describe_version
@@ -171,6 +171,9 @@ class Served:
         if not round_trip <= MOST_ROUND_TRIP:
             text = f"a round trip to {name} takes {1e3 * round_trip:.0f} ms, more than {1e3 * MOST_ROUND_TRIP:.0f} ms"
             raise ConnectionLost(f"{text}: a released dead-man would stop it too late", code="link_too_slow")
+        for box in self.link.incoming:
+            if isinstance(box, CommandBox):
+                box.on_the_way = 0.5 * round_trip
         most = 1.0 if asked.is_motion else spec.speed
         if not (0.0 < asked.speed <= most and 0.0 < asked.tcp_speed <= spec.tcp_speed):
             raise CommandError(f"faster than the rig that serves {name} allows", code="too_fast")

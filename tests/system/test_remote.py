@@ -415,6 +415,23 @@ def test_a_link_with_a_long_round_trip_opens_no_session(bench: Bench) -> None:
             pass
 
 
+def test_the_time_on_the_way_does_not_count_against_a_commands_deadline(bench: Bench) -> None:
+    bench.proxy.delay = 0.06
+    turn = hal.JointVelocity([0.1, 0, 0, 0, 0, 0, 0])
+    with (
+        hal.open({"robots": {"panda": {"at": bench.proxy.at}}}, pad="none") as rig,
+        rig.robots["panda"].control(rate_hz=50) as control,  # the next command within 100 ms
+    ):
+        for tick in rig.clock.rate(20):
+            control.send(turn)
+            if tick.elapsed > 0.5:
+                break
+        assert control.trip is Trip.NONE
+        with pytest.raises(hal.MotionStopped, match="commands stopped coming"):
+            rig.clock.sleep(0.5)
+            control.send(turn)
+
+
 @pytest.mark.alone
 def test_recordings_at_the_arm_and_at_the_program_agree_within_1_ms(bench: Bench, tmp_path: Path) -> None:
     bench.proxy.delay = 0.005
