@@ -107,7 +107,7 @@ class CollectRun:
         self._check_buttons()
         print(f"{self.session.help()}\n  record: {self._buttons(ACTIONS)}\n{list_links(self.rig)}", flush=True)
         try:
-            while not ended and len(self.kept) < self.args.episodes:
+            while not ended and self._marked < self.args.episodes:
                 ended = self._attempt()
         except KeyboardInterrupt:
             ended = "interrupted"  # the arm is at rest
@@ -135,7 +135,7 @@ class CollectRun:
         for last in (False, True):
             try:
                 wait([call for call in (self._starting, self._discarding) if call is not None])
-                if self.recorder.status().state == "recording":
+                if self.recorder.status().state in ("recording", "ended"):
                     self.session.announce(f"episode {self.number} was being recorded: saved, unmarked")
                     self.kept.append(SavedEpisode(self.number, self._seed, None, self._save(None)))
                 self._calls.shutdown()
@@ -268,17 +268,21 @@ class CollectRun:
         if action == "discard":
             self._discarding = self._call(self.recorder.discard)
             return DISCARDED
-        success, seconds = self._mark(action), self.recorder.status().seconds
+        success, status = self._mark(action), self.recorder.status()
         self.kept.append(SavedEpisode(self.number, self._seed, success, self._save(success)))
         if self.rig.lock_step:
             wait([self.kept[-1].status])  # simulated time stands still meanwhile
         mark = {True: "success", False: "failure", None: "not marked"}[success]
-        number, count = self.kept[-1].number, len(self.kept)
-        self.session.announce(f"episode {number}: {seconds:.1f} s, {mark}; {count} of {self.args.episodes} in this run")
+        text = f"episode {self.kept[-1].number}: {status.seconds:.1f} s{_describe_loss(status)}, {mark}"
+        self.session.announce(f"{text}; {self._marked} of {self.args.episodes} in this run")
         return SAVED
 
     def _mark(self, action: str) -> bool | None:
-        """Return the mark of an episode that is saved with this action; None if the judge fails."""
+        """Return the mark of an episode that is saved with this action; None if its recording or the judge fails."""
+        if action == "finish" and self._has_ended:
+            hint = f"hal dataset mark {self.recorder.root} {self.number} success"
+            self.session.announce(f"the recording ended before you saved it: not marked a success; else: {hint}")
+            return None
         if action != "finish" or self._judge is None:
             return action == "finish"
         try:
@@ -309,6 +313,16 @@ class CollectRun:
             if one.failure:
                 return f"episode {one.number} could not be saved: {one.failure}"
         return "the recorded pad has ended" if self.session.finished else ""
+
+    @property
+    def _has_ended(self) -> bool:
+        """Whether the recorder ended the open episode by itself: what is driven now is not recorded."""
+        return self.recorder.status().state == "ended"
+
+    @property
+    def _marked(self) -> int:
+        """Number of episodes of this run that count: saved as successes or failures."""
+        return sum(one.success is not None and not one.failure for one in self.kept)
 
     @property
     def _names(self) -> str:
@@ -354,7 +368,7 @@ class CollectRun:
         again = "reset again" if self.session.drives_home else "shuffle the objects"
         words = {
             "record": "start recording",
-            "finish": "save as success",
+            "finish": "save, not marked" if self._has_ended else "save as success",
             "fail": "save as failure",
             "discard": again if ready else f"discard (release {self.session.deadman_name} first)",
         }
@@ -373,9 +387,12 @@ class CollectRun:
         if status.trouble != self._trouble:
             self._trouble = status.trouble
             self.session.announce(f"RECORDING: {status.trouble or 'no more trouble'}")
-        lost = f", {status.dropped} DROPPED" if status.dropped else ""
-        doing = f"REC {status.seconds:.1f} s{lost}" if self.phase == "recording" else self.phase
-        self.display.note = f"{len(self.kept)} of {self.args.episodes}  {doing}  "
+            if status.state == "ended":
+                text = f"RECORDING ENDED after {status.seconds:.1f} s: nothing more is recorded"
+                self.session.announce(f"episode {self.number}: {text}; {self._prompt() or 'save or discard it'}")
+        doing = "ENDED" if status.state == "ended" else "REC"
+        doing = f"{doing} {status.seconds:.1f} s{_describe_loss(status)}" if self.phase == "recording" else self.phase
+        self.display.note = f"{self._marked} of {self.args.episodes}  {doing}  "
         if self.rig.console is not None:
             recording = self.phase == "recording"
             shown = status if recording else status._replace(seconds=0.0, frames=0, dropped=0)
@@ -387,7 +404,7 @@ class CollectRun:
             prompt=self._prompt(),
             task=self.args.task,
             episode=self.number,
-            saved=len(self.kept),
+            saved=self._marked,
             wanted=self.args.episodes,
             succeeded=sum(one.success is True for one in self.kept),
             failed=sum(one.success is False for one in self.kept),
@@ -403,7 +420,7 @@ class CollectRun:
     # The end.
 
     def _report(self, ended: str) -> int:
-        """Print the results and write ``--report``, once everything is saved; return the number of saved episodes."""
+        """Print the results and write ``--report``, once everything is saved; return the number of marked episodes."""
         for text in _summary(self.kept, self.recorder.root, self.discarded, ended):
             self.display.line.event(text)
         report = {
@@ -418,7 +435,7 @@ class CollectRun:
             "episodes": [one.as_json() for one in self.kept],
         }
         write_report(self.args.report, report)
-        return sum(not one.failure for one in self.kept)
+        return self._marked
 
 
 @dataclass(frozen=True, slots=True)
@@ -441,6 +458,10 @@ class SavedEpisode:
         """Return the entry for a report, once it is saved or could not be saved."""
         entry = {"number": self.number, "seed": self.seed, "success": self.success, "failure": self.failure}
         return entry if self.failure else entry | self.status.result()._asdict()
+
+
+def _describe_loss(status: RecorderStatus) -> str:
+    return f", {status.dropped} DROPPED" if status.dropped else ""
 
 
 def _summary(kept: Sequence[SavedEpisode], root: Path, discarded: int, ended: str) -> Iterator[str]:

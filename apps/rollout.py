@@ -351,7 +351,8 @@ class RolloutRun:
             outcome = self.runner.run(seed, lambda seconds: self._show(number, seconds))
         finally:
             if self.recorder is not None:
-                mark = None if outcome is None else outcome.success
+                is_whole = self.recorder.status().state == "recording"  # not ended by itself, before the policy
+                mark = outcome.success if outcome is not None and is_whole else None
                 self.recorder.save(mark, wait=True, result=self._result(outcome))
         self._noted = ""
         self._note_driver("")

@@ -54,7 +54,7 @@ class RecorderStatus(NamedTuple):
     """State of a recorder."""
 
     state: str
-    """``idle``, ``recording`` or ``saving``."""
+    """``idle``, ``recording``, ``ended`` (by itself: save or discard what it has) or ``saving``."""
     episode: int
     """Number of the current episode, or of the last one; -1 before the first."""
     frames: int
@@ -68,8 +68,7 @@ class RecorderStatus(NamedTuple):
     free_bytes: int
     """Free space on the disk, bytes."""
     trouble: str
-    """Problem that needs the operator's attention; empty if there is none. An episode that cannot continue records no
-    more rows, and can be saved or discarded with those that it has."""
+    """Problem that needs the operator's attention; empty if there is none."""
 
 
 class Recorder:
@@ -260,7 +259,8 @@ class Recorder:
         """Return the current state. Never blocks."""
         episode, saving = self._current, self._saving
         busy = saving is not None and not saving.done()
-        state = "saving" if busy else "recording" if self._is_open else "idle"
+        has_ended = episode is not None and bool(episode.trouble)
+        state = "saving" if busy else "idle" if not self._is_open else "ended" if has_ended else "recording"
         free = self._queue.free_bytes or int(self._child.ready["free_bytes"])
         failure = saving.exception() if saving is not None and not busy else None
         trouble = str(failure or (episode.trouble if episode is not None else ""))

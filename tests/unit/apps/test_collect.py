@@ -121,7 +121,7 @@ def test_a_function_confirms_successes(call: Collect, tmp_path: Path, body: str,
     name = f"judge_{mark}".lower()
     (tmp_path / f"{name}.py").write_text(f"def check(rig, observation):\n    {body}\n")
     pad = write_pad(tmp_path, (1.0, CROSS), (2.0, PS), (4.0, CROSS), (5.0, SQUARE), until=6.0)
-    assert call("--pad", pad, "--episodes", 2, "--success", f"{name}:check") == 0
+    assert call("--pad", pad, "--episodes", 2, "--success", f"{name}:check") == (mark is None)
     assert [episode.success for episode in episodes()] == [mark, False], "a failure stays one"
     assert call("--pad", pad, "--success", f"{name}:nothing") == 2
 
@@ -339,6 +339,32 @@ def test_a_full_disk_is_shown_and_the_arm_can_still_be_driven(
         assert "NOT RECORDING" in printed
         assert "has ended" in printed, "the pad drove until its end"
         assert not list((tmp_path / "data").rglob("*.parquet"))
+
+
+@pytest.mark.parametrize("end", [PS, SQUARE])
+def test_a_recording_that_ends_by_itself_is_named_and_is_no_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
+) -> None:
+    pad = write_pad(tmp_path, (1.0, CROSS), (4.0, end), until=6.0)
+    rig = hal.open("panda_table", sim=True, clock="lock_step", pad=pad, overrides=["cameras={}"])
+    with rig, Recorder(rig, tmp_path / "data") as recorder:
+        read_row = recorder._sampler.row
+
+        def read(*arguments: Any) -> Any:
+            if recorder.status().seconds > 0.5:
+                raise hal.StaleStateError("camera wrist has sent no picture")
+            return read_row(*arguments)
+
+        recorder._sampler.row = read  # type: ignore[method-assign]
+        page = rig.console = Page(rig, lambda view: "")
+        args = collect.parser().parse_args(["--episodes", "1"])
+        assert CollectRun(rig, [rig.robots["panda"]], recorder, args).run() == (end == PS), "it does not count"
+    printed = capsys.readouterr().out
+    assert "RECORDING ENDED after" in printed
+    assert ("not marked a success" in printed) == (end == PS)
+    (episode,) = Dataset(tmp_path / "data").episodes
+    assert episode.success is (None if end == PS else False)
+    assert any("save, not marked" in view.prompt for view in page.views)
 
 
 def test_an_arm_that_is_not_simulated_drives_home_while_l2_is_held(
