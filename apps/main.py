@@ -61,19 +61,21 @@ LISTS = {
     "leaders": ("sensors", "leaders"),
 }
 """Kind of built-in file -> its folder."""
+COMMANDS = {
+    "list": f"list built-in files: {', '.join(LISTS)}",
+    "schema": "print the JSON schema of a rig's file, for editors",
+}
+"""Command of ``hal`` itself -> what it does."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    programs = "\n".join(f"  {name:13s} {what}" for name, what in PROGRAMS.items())
+    programs, own = ("\n".join(f"  {name:13s} {what}" for name, what in each.items()) for each in (PROGRAMS, COMMANDS))
     beside = "\n".join(f"  {name:13s} {what} ({folder})" for name, (what, folder) in BESIDE.items())
     made = argparse.ArgumentParser(
         prog="hal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description=f"programs:\n{programs}\n\n"
-        f"  {'list':13s} list built-in files: {', '.join(LISTS)}\n"
-        f"  {'schema':13s} print the JSON schema of a rig's file, for editors\n\n"
-        f"programs of other packages:\n{beside}",
+        description=f"programs:\n{programs}\n\n{own}\n\nprograms of other packages:\n{beside}",
         epilog="hal PROGRAM --help shows a program's own options.",
     )
     made.add_argument("--version", action="store_true", help="print the version")
@@ -121,7 +123,7 @@ def _find_program(name: str) -> Callable[[list[str]], int]:
         folder = BESIDE[name][1]
         message = f"hal {name} is a package of its own: pip install -e {folder}, in the repository of robot-hal"
         raise DriverMissing(message, code="missing_package")
-    programs = [*PROGRAMS, *BESIDE, *(point.name for point in entry_points(group=GROUP)), "list", "schema"]
+    programs = [*PROGRAMS, *BESIDE, *(point.name for point in entry_points(group=GROUP)), *COMMANDS]
     raise CommandError(f"there is no program {name!r}{suggest(name, set(programs))}", code="unknown_program")
 
 

@@ -30,7 +30,7 @@ from pydantic_core.core_schema import ModelSchema
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..registry import explain_engine
-from ..specs import ViewSpec
+from ..specs import CollisionSpec, ViewSpec
 from ..types import STREAMS
 from .models import (
     Capture,
@@ -479,7 +479,7 @@ class CollisionsConfig(Strict):
         default_factory=list, max_length=DEVICES
     )
     """Boxes that no arm may touch: ``{name, position, size}``, or names of objects of this rig."""
-    margin: Margin = 0.01
+    margin: Margin = CollisionSpec.margin
     """Distance that is kept, m."""
 
 
