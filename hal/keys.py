@@ -74,7 +74,8 @@ def make_key(role: str, name: str, addresses: Sequence[str] = (), days: int = DA
         days: How long it is valid.
 
     Raises:
-        CommandError: A name or a number that cannot be (code ``bad_name``, ``bad_days``).
+        CommandError: A name or a number that cannot be (code ``bad_name``, ``bad_days``), or the authority is that of
+            another computer (``no_authority``).
         DriverMissing: The program openssl is missing, or older than 3.0.
     """
     for word in (name, *addresses):
@@ -87,6 +88,9 @@ def make_key(role: str, name: str, addresses: Sequence[str] = (), days: int = DA
     folder.chmod(0o700)
     authority, key = folder / "authority.crt", folder / "authority.key"
     if not key.exists():
+        if there := [file.name for file in (*sorted(folder.glob("*.pem")), folder / LIST) if file.exists()]:
+            text = f"{folder} has {', '.join(there)}, but no {key.name}: do this on the computer that made them"
+            raise CommandError(f"{text}, or name an empty folder in HAL_KEYS for a new authority", code="no_authority")
         made = _make(f"robot-hal of {_own_name('person')}", _AUTHORITY_DAYS, "CA:TRUE,pathlen:0", "keyCertSign")
         _write(authority, "".join(_PEM.findall(made)))
         _write(key, _PEM.sub("", made))
@@ -271,12 +275,13 @@ class Credentials:
         """
         name: str = next(value for part in certificate["subject"] for key, value in part if key == "commonName")
         if any(line.revoked and line.serial == certificate["serialNumber"] for line in read_list(self.file.parent)):
-            text = f"the certificate of {name} is revoked: `hal keys make` makes a new one"
+            text = f"the certificate of {name} is revoked: {_MAKE[not self._host]} makes a new one"
             raise ConnectionLost(text, code="certificate_revoked")
         if is_viewer(certificate) and not viewers:
             raise ConnectionLost(f"{name} may only watch arms and cameras", code="certificate_wrong_role")
         if time.time() > ssl.cert_time_to_seconds(certificate["notAfter"]):
-            raise ConnectionLost(_EXPIRED.format(f"the certificate of {name}"), code=_THEIRS[10][0])
+            text = _EXPIRED.format(f"the certificate of {name}", _MAKE[not self._host])
+            raise ConnectionLost(text, code=_THEIRS[10][0])
         return name
 
     def explain(self, error: BaseException, at: str) -> ConnectionLost:
@@ -289,10 +294,10 @@ class Credentials:
         if isinstance(error, ssl.SSLCertVerificationError):
             other = ("certificate_foreign", "{} is refused: " + error.verify_message)
             code, text = _THEIRS.get(error.verify_code, other)
-            return ConnectionLost(text.format(f"the certificate of {at}"), code=code)
+            return ConnectionLost(text.format(f"the certificate of {at}", _MAKE[not self._host]), code=code)
         for end, code, text in _OURS:
             if reason.endswith(end):
-                return ConnectionLost(f"{at} refuses: {text.format(self.file)}", code=code)
+                return ConnectionLost(f"{at} refuses: {text.format(self.file, _MAKE[self._host])}", code=code)
         if reason == "PEER_DID_NOT_RETURN_A_CERTIFICATE":
             text = f"{at} shows no certificate: `hal keys make --person NAME`"
             return ConnectionLost(text, code="certificate_missing")
@@ -327,7 +332,9 @@ def hang_up(sock: socket.socket) -> None:
     sock.close()
 
 
-_EXPIRED = "{} has expired: make a new one with `hal keys make`, and copy it there (or is a clock wrong? `date`)"
+_MAKE = ("`hal keys make --person NAME`", "`hal keys make --host NAME ADDRESS`")
+"""What makes the certificate of a person, and of a host."""
+_EXPIRED = "{} has expired: {} makes a new one, to be copied there (or is a clock wrong? `date`)"
 _FOREIGN = "{} is not from the authority of this end's: make both with `hal keys make` on one computer"
 _ROLE = "{} is for the other end: a host needs one of `hal keys make --host`, a program one of `--person`"
 _NAMES = "{} is for other names or addresses: `hal keys make --host NAME ADDRESS`, with the one that the rig has"

@@ -9,7 +9,7 @@ from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConnectionLost
 from hal.host.process import unpack_error
 from hal.remote.client import connect
-from hal.remote.frames import LARGEST, ReceivedFrames, unpack_info
+from hal.remote.frames import LARGEST, ReceivedFrames, check_camera, unpack_info
 from hal.remote.link import RigLink
 from hal.specs import CameraSpec
 
@@ -37,6 +37,11 @@ class ServedCamera(CameraDriver):
         if self._link is not None:
             return
         link, answer = connect(str(self.spec.at), {"want": "frames", "camera": self.spec.name})
+        try:
+            check_camera(self.spec, answer["camera"])
+        except ConnectionLost:
+            link.close()
+            raise
         link.largest = LARGEST
         self._info = unpack_info(answer["info"])
         self._frames = ReceivedFrames(self.spec)

@@ -63,7 +63,7 @@ def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:
         link.post(describe_version() | purpose)
         answer = link.await_message()
         if "error" in answer:
-            raise unpack_error(answer["error"])
+            raise unpack_error({**answer["error"], "text": f"{at}: {answer['error']['text']}"})
     except ConnectionLost as error:
         link.close()
         if credentials is not None and isinstance(error.__cause__, ssl.SSLError):  # what the server has against us

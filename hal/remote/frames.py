@@ -12,6 +12,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from ..arguments import freeze
 from ..driver import CameraInfo, RawFrame, StreamInfo
 from ..errors import ConnectionLost
 from ..geometry import Pose
-from ..specs import CameraSpec
+from ..specs import CameraSpec, to_json
 from ..types import STREAMS, Frame
 from .boxes import Box
 from .link import RigLink
@@ -100,7 +101,7 @@ def send_frames(camera: Camera, link: RigLink, over: threading.Event) -> None:
     frames = SentFrames(camera, link)
     try:
         camera.check()
-        link.post({"info": pack_info(camera.info)})
+        link.post({"info": pack_info(camera.info), "camera": describe_camera(camera.spec)})
         link.outgoing = [frames]
         while not over.is_set():
             link.wait(_PERIOD)
@@ -192,6 +193,22 @@ def _to_metres(units: NDArray[np.uint16], spec: CameraSpec) -> NDArray[np.float3
 
 
 # What a camera is, as JSON.
+
+
+def describe_camera(spec: CameraSpec) -> dict[str, Any]:
+    """Return the record of a camera without the options of its driver."""
+    described: dict[str, Any] = to_json(replace(spec, options={}))
+    return described
+
+
+def check_camera(spec: CameraSpec, there: dict[str, Any]) -> None:
+    """Raise ConnectionLost if a computer now serves, under its name, another camera than a rig was opened with."""
+    here = json.loads(json.dumps(describe_camera(spec)))
+    own = ("driver", "at", "view")  # of the rig that was opened; frames have their pose
+    changed = [key for key in here if key not in own and here[key] != there[key]]
+    if changed:
+        text = f"{spec.at} serves another camera {spec.name!r} now ({', '.join(changed)} changed): open the rig again"
+        raise ConnectionLost(text, code="other_camera")
 
 
 def pack_info(info: CameraInfo) -> dict[str, Any]:

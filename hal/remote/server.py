@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..commands import NO_SESSION, DeadmanRecord, Session
 from ..errors import CommandError, ConnectionLost, ControlTaken, HalError, NotSupported
+from ..gamepad import Gamepad
 from ..host.hosts import RemoteHost
 from ..host.process import STOP_LIMIT, pack_error
 from ..host.records import GripperMail, RobotMail
@@ -24,7 +25,7 @@ from ..servo.watchdog import SILENCE
 from ..specs import CameraSpec, PadSpec, Plan, RobotSpec, to_json
 from .boxes import CommandBox, boxes_of_hosts, boxes_of_program
 from .entrance import Entrance
-from .frames import send_frames
+from .frames import describe_camera, send_frames
 from .link import CLOSE_LIMIT, MOST_ROUND_TRIP, RigLink, describe_version
 from .measure import echo
 from .pads import send_readings
@@ -291,7 +292,9 @@ class Server:
                 served = self._lend(link, wish)
             elif link.viewer and want == "pad":
                 raise NotSupported("a viewer may not use a gamepad", code="read_only")
-            elif not self._readers.acquire(blocking=False):
+            else:
+                device = self._rig.gamepads[wish["pad"]] if want == "pad" else self._rig.cameras[wish["camera"]]
+            if want != "control" and not self._readers.acquire(blocking=False):
                 raise ControlTaken(f"there are {MOST_READERS} readers of cameras and gamepads", code="too_many_readers")
         except HalError as error:
             link.say_last({"error": pack_error(error)})
@@ -300,10 +303,10 @@ class Server:
         try:
             if want == "control":
                 self._run(served, ", ".join(name for name, _ in wish["robots"]))
-            elif want == "pad":
-                send_readings(self._rig.gamepads[wish["pad"]], link, self._over)
+            elif isinstance(device, Gamepad):
+                send_readings(device, link, self._over)
             else:
-                send_frames(self._rig.cameras[wish["camera"]], link, self._over)
+                send_frames(device, link, self._over)
         except ConnectionLost as error:
             self._report(f"{link.at}: {error}")
             if want != "control":
@@ -380,7 +383,7 @@ def describe_devices(plan: Plan) -> dict[str, Any]:
     }
     return {
         "robots": [to_json(robot) for robot in public],
-        "cameras": [to_json(replace(camera, options={})) for camera in plan.cameras],
+        "cameras": [describe_camera(camera) for camera in plan.cameras],
         "pads": [to_json(pad) for pad in pads],
         "urdfs": {path: Path(path).read_text(encoding="utf-8") for path in sorted(files)},
     }

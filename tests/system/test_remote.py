@@ -26,7 +26,7 @@ from waiting import wait_until
 import hal
 from hal.apps import collect, replay, rollout
 from hal.deadman import Deadman
-from hal.errors import CommandError, ConnectionLost, ControlTaken, NotSupported
+from hal.errors import CommandError, ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
 from hal.host import records
 from hal.host.scheduling import LINK_PRIORITY
 from hal.lock import APP_MARK
@@ -466,6 +466,9 @@ def test_who_may_connect_and_ask_for_what(bench: Bench, monkeypatch: pytest.Monk
         for terms in ([1, 0.9, 0.25, False], [1, 0.3, 5.0, False], [1, float("nan"), 0.25, False]):
             with raises_code(CommandError, "too_fast"):  # whatever the program's own checks let pass
                 first._hosts[0].request("begin", {"robot": "panda", "session": terms})
+    for want, kind in (("pad", "gamepad"), ("frames", "camera")):  # as of a rig that was opened before a restart
+        with pytest.raises(DeviceNotFound, match=f"^{bench.proxy.at}: this rig has no {kind} 'left'"):
+            connect(bench.proxy.at, {"want": want, "pad": "left", "camera": "left"})
     monkeypatch.setattr("hal.remote.link.LAYOUT", records.LAYOUT + 1)
     monkeypatch.setattr("hal.remote.server.describe_version", lambda: {"version": "0.0", "layout": records.LAYOUT})
     with raises_code(NotSupported, "version_mismatch"):

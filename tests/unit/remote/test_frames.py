@@ -6,6 +6,7 @@ import json
 import socket
 import struct
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,15 @@ from errors_kit import raises_code
 from hal.errors import ConnectionLost
 from hal.geometry import Pose
 from hal.remote.boxes import ITEM
-from hal.remote.frames import LARGEST, ReceivedFrames, SentFrames, decode_frame, encode_frame
+from hal.remote.frames import (
+    LARGEST,
+    ReceivedFrames,
+    SentFrames,
+    check_camera,
+    decode_frame,
+    describe_camera,
+    encode_frame,
+)
 from hal.remote.link import RigLink
 from hal.specs import CameraSpec, DepthSensorSpec
 from hal.testing import camera_spec
@@ -39,6 +48,14 @@ def picture(spec: CameraSpec, seq: int, measured: bool = True) -> Frame:
     where = Pose([1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])
     stamp = Stamp(5.0 + seq, 0.5 * seq, seq)
     return Frame(stamp, color, depth, infrared, bodies, np.eye(3), np.zeros(5), where, None, 0.004)
+
+
+def test_a_camera_that_comes_back_as_another_one_is_refused() -> None:
+    then = camera()
+    check_camera(replace(then, at="pc", driver="served", view=None), json.loads(json.dumps(describe_camera(then))))
+    for now in (camera(width=128), replace(then, K=((1.0, 0.0, 0.0), *then.K[1:])), replace(then, align="depth")):
+        with raises_code(ConnectionLost, "other_camera"):
+            check_camera(then, json.loads(json.dumps(describe_camera(now))))
 
 
 @pytest.mark.parametrize("compress", [False, True], ids=["as it is", "compressed"])

@@ -148,6 +148,11 @@ def test_keys_are_private_listed_and_revoked_by_name(
     find_key("host").chmod(0o640)
     with raises_code(NotSupported, "keys_readable"):
         find_key("host")
+    (folder / "authority.key").unlink()  # as on a host: another authority would replace what works
+    before = (folder / "host-arm-pc.pem").read_bytes()
+    with raises_code(CommandError, "no_authority"):
+        make_key("host", "arm-pc")
+    assert (folder / "host-arm-pc.pem").read_bytes() == before
 
 
 @pytest.mark.parametrize("arguments", [["make", "--person", "../x"], ["make", "--person", "x", "--days", "0"]])
