@@ -52,7 +52,8 @@ class HandleDrag:
     def __init__(self) -> None:
         self._lock = threading.RLock()
         self._seq = 0
-        self._goal: DraggedGoal | None = None
+        self.goal: DraggedGoal | None = None
+        """The newest goal; None when there is none."""
         self._owner = 0
         self._grabbed = False
         self._used = 0.0
@@ -60,14 +61,9 @@ class HandleDrag:
         self._tripped = False
 
     @property
-    def goal(self) -> DraggedGoal | None:
-        """The newest goal; None when there is none."""
-        return self._goal
-
-    @property
     def free(self) -> bool:
         """Whether the handle follows the tcp."""
-        return self._goal is None and not self._grabbed
+        return self.goal is None and not self._grabbed
 
     def grab(self, page: int) -> None:
         """Grab the handle for a page; no effect while another page holds it."""
@@ -82,7 +78,7 @@ class HandleDrag:
             if pose is None or not self._grabbed or page != self._owner:
                 return False
             self._seq += 1
-            self._goal = DraggedGoal(self._seq, page, pose)
+            self.goal = DraggedGoal(self._seq, page, pose)
             self._used, self._nearest = now, inf
             return True
 
@@ -101,7 +97,7 @@ class HandleDrag:
     def clear(self) -> None:
         """Clear the goal. A drag under way counts again only after the handle is released and grabbed."""
         with self._lock:
-            self._goal, self._owner, self._grabbed = None, 0, False
+            self.goal, self._owner, self._grabbed = None, 0, False
 
     def update(self, now: float, tcps: Sequence[Pose], *, tripped: bool) -> None:
         """Clear the goal where it is reached, unused, or older than a trip.
@@ -117,9 +113,9 @@ class HandleDrag:
             if tripped and not self._tripped:
                 self.clear()
             self._tripped = tripped
-            if self._goal is None:
+            if self.goal is None:
                 return
-            distances = [tcp.distance(self._goal.pose) for tcp in tcps]
+            distances = [tcp.distance(self.goal.pose) for tcp in tcps]
             nearest = min(distance + 0.2 * angle for distance, angle in distances)
             if nearest < self._nearest - _APPROACH:
                 self._used, self._nearest = now, nearest

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import viser
 import websockets.asyncio.server
-from viser import ClientHandle, GuiEvent, ViserServer
+from viser import ClientHandle, ViserServer
 
 from hal.drivers.scene.mirror import WorldMirror
 from hal.errors import HalError, NotSupported
@@ -24,9 +24,9 @@ from hal.host.process import Channel, SharedMemory, serve
 from hal.host.records import GroupMemory
 from hal.host.scheduling import yield_to_others
 from hal.kinematics.collisions import in_one_place
-from hal.specs import CollisionSpec, GroupSpec, from_json
+from hal.specs import CameraSpec, CollisionSpec, GroupSpec, from_json
 
-from .scene import PAGE, ArmView, BodiesView, DrawnArm
+from .scene import PAGE, ArmView, BodiesView, DrawnArm, draw_cameras
 from .shapes import ShapesView
 
 _NICE = 10
@@ -37,6 +37,7 @@ _IDLE = 0.1
 """The same while no page is open, s."""
 _WORLD_PERIOD = 1 / 15
 """Time between two updates of the bodies around the arms, and of the shapes that are near each other, s."""
+_PINK = (200, 40, 160)
 _REPEAT = 0.1
 """Time after which a goal is sent again as a sign of life, s."""
 
@@ -47,11 +48,12 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     Args:
         channel: Connection to the app.
         memories: Memory of each host, in the order of ``config["groups"]``.
-        config: ``label`` of the page, ``address`` of its socket, and the ``groups``.
+        config: ``label`` of the page, ``address`` of its socket, the ``groups``, and the ``cameras``.
     """
     yield_to_others(_NICE)
     server = start_server(config["address"], config["label"])
     page = ViewerPage(server, [from_json(GroupSpec, group) for group in config["groups"]], memories)
+    draw_cameras(server.scene, [from_json(CameraSpec, camera) for camera in config["cameras"]], page.arms)
     channel.send({"ready": {"notes": page.notes}})
 
     def update() -> float:
@@ -60,7 +62,8 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
         page.report(channel)
         return max(0.0, due - time.monotonic())
 
-    serve(channel, {"clear": page.clear_goal, "edited": page.note_edit}, update)
+    methods: Any = {"clear": page.clear_goals, "edited": page.note_edit, "forces": page.show_forces}
+    serve(channel, methods, update)
 
 
 class PrivateServer(ViserServer):
@@ -108,8 +111,8 @@ class ViewerPage:
         """What is not drawn, and why; for the user."""
         self._server = server
         self._due = self._report_due = 0.0
-        self._sent: dict[str, int] = {}
-        """Numbers of the goals that were sent last."""
+        self._sent: tuple[dict[str, int], bool] = {}, False
+        """Numbers of the goals, and whether a page was open, as they were sent last."""
         self.world: BodiesView | None = None
         self._mirror: WorldMirror | None = None
         self.arms: list[ArmView] = []
@@ -130,11 +133,14 @@ class ViewerPage:
         bodies = [body for group in groups if group.world is not None for body in group.world.bodies]
         if not any(body.shape == "plane" and body.visible for body in bodies):
             server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
+        self._forces = server.scene.add_arrows(
+            "/forces", np.zeros((1, 2, 3)), _PINK, shaft_radius=0.003, head_radius=0.01, head_length=0.02, visible=False
+        )
         set_camera(server, self.arms)
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="small")
         server.gui.main_panel.minimize()
         reset_button = server.gui.add_button("Reset gizmo", hint="Put it back to the tool, and clear its goal.")
-        reset_button.on_click(self._reset_handles)
+        reset_button.on_click(lambda _: self.clear_goals(None))
         server.on_client_disconnect(self._on_disconnect)
 
     def _draw_shapes(self, groups: Sequence[GroupSpec]) -> dict[str, ShapesView]:
@@ -157,31 +163,33 @@ class ViewerPage:
         for arm in self.arms:
             arm.drag.leave(PAGE.get())
 
-    async def _reset_handles(self, _: GuiEvent) -> None:  # type: ignore[type-arg]
-        """Put all handles back to their tcps, and clear their goals."""
+    def clear_goals(self, robot: str | None) -> None:
+        """Put the handle of one arm, or those of all, back to the tcp, and clear the goal."""
         for arm in self.arms:
-            arm.drag.clear()
-
-    def clear_goal(self, robot: str) -> None:
-        """Put the handle of one arm back to its tcp, and clear its goal."""
-        for arm in self.arms:
-            if arm.spec.name == robot:
+            if robot in (None, arm.spec.name):
                 arm.drag.clear()
 
+    def show_forces(self, arrows: Sequence[Sequence[Sequence[float]]]) -> None:
+        """Draw the forces on the arms as arrows: the ends of each in the world, m."""
+        self._forces.visible = bool(arrows)
+        if arrows:
+            self._forces.points = np.array(arrows, np.float32)
+
     def report(self, channel: Channel) -> None:
-        """Send the goals of the handles to the app, when they change and periodically.
+        """Send the goals of the handles, and whether a page is open, when they change; goals periodically.
 
         Raises:
             ConnectionLost: The app is gone.
         """
         goals = {arm.spec.name: goal for arm in self.arms if (goal := arm.drag.goal) is not None}
         numbers = {robot: goal.seq for robot, goal in goals.items()}
-        now = time.monotonic()
-        if numbers == self._sent and (not goals or now < self._report_due):
+        now, watched = time.monotonic(), self.watched
+        if (numbers, watched) == self._sent and (not goals or now < self._report_due):
             return
-        self._sent, self._report_due = numbers, now + _REPEAT
+        self._sent, self._report_due = (numbers, watched), now + _REPEAT
         poses = {name: (*goal.pose.position.tolist(), *goal.pose.orientation.tolist()) for name, goal in goals.items()}
-        channel.send({"goals": {name: [goal.seq, goal.page, *poses[name]] for name, goal in goals.items()}, "t": now})
+        found = {name: [goal.seq, goal.page, *poses[name]] for name, goal in goals.items()}
+        channel.send({"goals": found, "t": now, "watched": watched})
 
     def note_edit(self, method: str, params: dict[str, Any], revision: int) -> None:
         """Note an edit of the simulated world; it is shown with the snapshot of its revision."""

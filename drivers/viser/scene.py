@@ -7,12 +7,14 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
+from math import atan
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
+from hal.camera import frame_from_color
 from hal.drivers.scene.drawn import DrawnBody, DrawnWorld, link_visual
 from hal.drivers.scene.shapes import Visual
 from hal.drivers.scene.urdf_files import absent_packages, drawn_visuals, where_to_get
@@ -20,7 +22,7 @@ from hal.errors import HalError
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.host.records import GripperMail, RobotMail
 from hal.kinematics.urdf import UrdfJoint, UrdfModel, read_urdf
-from hal.specs import BodySpec, RobotSpec, WorkspaceSpec, WorldSpec
+from hal.specs import BodySpec, CameraSpec, RobotSpec, WorkspaceSpec, WorldSpec
 from hal.types import RobotState, Trip
 
 from .goals import HandleDrag
@@ -58,7 +60,7 @@ class DrawnArm:
             position=spec.base_position,
             wxyz=_wxyz(spec.base_orientation),
         )
-        self._links = _draw_links(scene, f"{root}/links", urdf, spec, notes)
+        self.paths, self._links = _draw_links(scene, f"{root}/links", urdf, spec, notes)
         self._set = scene.add_frame(f"{root}/set", axes_length=0.06, axes_radius=0.002, origin_radius=0.004)
         if spec.workspace is not None:
             lines = workspace_lines(spec.workspace)
@@ -139,8 +141,9 @@ class ArmView(DrawnArm):
 
 def _draw_links(
     scene: SceneApi, root: str, urdf: UrdfModel, spec: RobotSpec, notes: list[str]
-) -> list[tuple[UrdfJoint, SceneNodeHandle]]:
-    """Draw all links, each in a child frame of its parent's; return the joints that move, with the frames they move.
+) -> tuple[dict[str, str], list[tuple[UrdfJoint, SceneNodeHandle]]]:
+    """Draw all links, each in a child frame of its parent's; return the paths of the links' frames, and the joints that
+    move, with the frames that they move.
 
     The page composes the frames by itself, so a joint at rest needs no message.
     """
@@ -157,7 +160,19 @@ def _draw_links(
             moving.append((joint, node))
     for name, visuals in shown_visuals(urdf, spec.name, notes).items():
         _draw_visuals(scene, paths[name], visuals, notes)
-    return moving
+    return paths, moving
+
+
+def draw_cameras(scene: SceneApi, cameras: Sequence[CameraSpec], arms: Sequence[DrawnArm]) -> None:
+    """Draw what each camera sees as a small pyramid, in the world or on the link that carries it, if that is known."""
+    paths = {arm.spec.name: arm.paths for arm in arms}
+    for camera in cameras:
+        if (view := camera.view) is not None:
+            pose = Pose(view.position, view.orientation) @ frame_from_color(camera)
+            wide, high = camera.width / camera.K[0][0], camera.height / camera.K[1][1]
+            path = f"{paths[view.robot][str(view.link)] if view.robot else '/cameras'}/{camera.name}"
+            node = scene.add_camera_frustum(path, 2.0 * atan(high / 2.0), wide / high, scale=0.06, thickness=0.003)
+            move_node(node, pose.position, pose.orientation)
 
 
 def workspace_lines(workspace: WorkspaceSpec) -> NDArray[np.float32]:
@@ -249,14 +264,10 @@ def _draw_visuals(scene: SceneApi, parent: str, visuals: Sequence[Visual], notes
 def move_node(node: SceneNodeHandle, position: Vector, orientation: Vector) -> None:
     """Set the pose of a node in its parent's frame, unless it is there already; orientation x, y, z, w."""
     at, turn = np.asarray(position, float), np.asarray(_wxyz(orientation))
-    if not _alike(node.position, at):
+    if np.abs(node.position - at).max() > _AT_REST:
         node.position = at
-    if not _alike(node.wxyz, turn) and not _alike(node.wxyz, -turn):
+    if min(np.abs(node.wxyz - turn).max(), np.abs(node.wxyz + turn).max()) > _AT_REST:
         node.wxyz = turn
-
-
-def _alike(present: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
-    return bool(np.abs(present - wanted).max() <= _AT_REST)
 
 
 def _wxyz(orientation: Vector) -> tuple[float, float, float, float]:

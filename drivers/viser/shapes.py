@@ -143,7 +143,5 @@ def _show(nodes: Sequence[MeshHandle], model: CollisionModel, colors: Mapping[in
     for number, (node, (_, _, pose)) in enumerate(zip(nodes, model.shapes(), strict=True)):
         if number in colors:
             move_node(node, pose[:3, 3], matrix_to_quaternion(pose[:3, :3]))
-            if tuple(node.color) != colors[number]:
-                node.color = colors[number]
-        if node.visible != (number in colors):
-            node.visible = number in colors
+            node.color = colors[number]
+        node.visible = number in colors

@@ -6,16 +6,19 @@ import tempfile
 import threading
 import time
 from collections import deque
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from importlib.metadata import version
 from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hal import registry
-from hal.errors import ConnectionLost, DeviceNotFound, DriverMissing
+from hal.errors import ConnectionLost, DeviceNotFound, DriverMissing, HalError
 from hal.geometry import Pose
 from hal.host.process import Child
 from hal.specs import to_json
 from hal.views import Viewer3D
+from hal.world import Contact
 
 from .goals import checked_pose
 
@@ -26,6 +29,10 @@ _SILENCE = 0.5
 """Time after which a goal that is not repeated does not count: its process hangs, or is gone, s."""
 _POLL = 0.05
 """Longest wait for a message of the process before new ones are sent to it, s."""
+_CONTACTS = 0.1
+"""Time between two looks at the contacts of the simulated arms while a page is open, s."""
+_LEAST, _PER_NEWTON, _LONGEST = 0.1, 0.005, 0.5
+"""Least force that is drawn, N; length of its arrow, m/N and at most m."""
 _WAITING = 1000
 """Number of edits of the world that may wait for the process; more are lost, and it then shows no further edits."""
 
@@ -60,6 +67,8 @@ class ViserViewer(Viewer3D):
         self._goals: dict[str, _ReportedGoal] = {}
         self._cleared = dict.fromkeys(self._robots, 0)
         self._to_clear: set[str] = set()
+        self._watched, self._contacts_due = False, 0.0
+        self._arrows: list[list[list[float]]] = []
         self._edits: deque[dict[str, Any]] = deque(maxlen=_WAITING)
         self._lock = threading.Lock()
         self._closed = threading.Event()
@@ -69,6 +78,7 @@ class ViserViewer(Viewer3D):
             "label": f"robot-hal: {', '.join(sorted(self._robots))}",
             "address": self.address,
             "groups": [to_json(group.spec) for group in groups],
+            "cameras": [to_json(camera) for camera in rig.plan.cameras],
         }
         self._child = Child("3D viewer", "hal.drivers.viser.process:main", config, [group.memory for group in groups])
 
@@ -112,11 +122,12 @@ class ViserViewer(Viewer3D):
         channel = self._child.channel
         try:
             while not self._closed.is_set():
-                for method, params in self._take_outgoing():
+                for method, params in (*self._take_outgoing(), *self._find_forces()):
                     channel.send({"method": method, "params": params})
                 message = channel.receive(_POLL)
                 if message is None:
                     continue
+                self._watched = message["watched"]
                 self._set_goals(message["goals"], message["t"])
         except ConnectionLost:
             pass  # the process is gone; the arms work without it
@@ -130,6 +141,19 @@ class ViserViewer(Viewer3D):
             self._edits.clear()
             self._to_clear.clear()
         return found
+
+    def _find_forces(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield a message with the forces on the arms, if they changed, while a page is open."""
+        now = time.monotonic()
+        if not self._watched or now < self._contacts_due:
+            return
+        self._contacts_due = now + _CONTACTS
+        arrows = []
+        with suppress(HalError):  # nothing is simulated, or the simulation has ended
+            arrows = arrows_of(self.rig.world.contacts(), self._robots)
+        if arrows != self._arrows:
+            self._arrows = arrows
+            yield "forces", {"arrows": arrows}
 
     def _set_goals(self, goals: dict[str, list[float]], t: float) -> None:
         """Replace the goals by those of a message, without goals that were cleared meanwhile.
@@ -155,3 +179,14 @@ class ViserViewer(Viewer3D):
             self._thread.join(timeout=2.0)
         self._child.close()
         self._folder.cleanup()
+
+
+def arrows_of(contacts: Iterable[Contact], robots: Collection[str]) -> list[list[list[float]]]:
+    """Return both ends, in the world, m, of an arrow for the force on an arm at each of its contacts."""
+    arrows = []
+    for contact in contacts:
+        for name, sign in ((contact.a, 1.0), (contact.b, -1.0)):
+            if name in robots and contact.force > _LEAST:
+                way = sign * min(_PER_NEWTON * contact.force, _LONGEST) * contact.normal
+                arrows.append([contact.position.tolist(), (contact.position + way).tolist()])
+    return arrows

@@ -26,7 +26,7 @@ from hal.host.process import Channel, Child, SharedMemory
 from hal.host.ring import frame_rings, frame_rings_size
 from hal.keys import find_credentials, needs_keys
 from hal.pads.keyboard import keyboard_table
-from hal.specs import CameraSpec, GroupSpec, PadSpec, RobotSpec, to_json
+from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
 from hal.types import STREAMS, Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
 
@@ -373,6 +373,7 @@ def _name_streams(camera: CameraSpec) -> dict[str, str]:
 
 def _rig_message(rig: Rig, driven_by: str | None) -> dict[str, Any]:
     """Return everything that does not change while the rig is open."""
+    pads = [pad for pad in rig.plan.pads if pad.driver in ("auto", "web")]
     return {
         "source": rig.plan.source,
         "sim": rig.plan.sim,
@@ -381,18 +382,12 @@ def _rig_message(rig: Rig, driven_by: str | None) -> dict[str, Any]:
         "drivable": driven_by is None,
         "driven_by": driven_by,
         "demo": driven_by is None and (rig.emulated or not rig.attended),
-        "hands": sorted({pad.hand or "any" for pad in _page_pads(rig)}),
-        "pad_may_hold": not rig.attended or _accepts_silent_pads(rig),
+        "hands": sorted({pad.hand or "any" for pad in pads}),
+        "pad_may_hold": not rig.attended or any(pad.options.get("accept_silent_pad") is True for pad in pads),
         "robots": [_robot_message(robot) for robot in rig.plan.robots],
         "cameras": [
-            {
-                "name": camera.name,
-                "width": camera.width,
-                "height": camera.height,
-                "rate_hz": camera.rate_hz,
-                "streams": _name_streams(camera),
-                "depth": [camera.depth_min, camera.depth_max],
-            }
+            {name: getattr(camera, name) for name in ("name", "width", "height", "rate_hz")}
+            | {"streams": _name_streams(camera), "depth": [camera.depth_min, camera.depth_max]}
             for camera in rig.plan.cameras
         ],
     }
@@ -410,14 +405,6 @@ def _robot_message(robot: RobotSpec) -> dict[str, Any]:
         "tcp_speed": robot.tcp_speed,
         "widths": [robot.gripper.width_min, robot.gripper.width_max] if robot.gripper is not None else None,
     }
-
-
-def _page_pads(rig: Rig) -> list[PadSpec]:
-    return [pad for pad in rig.plan.pads if pad.driver in ("auto", "web")]
-
-
-def _accepts_silent_pads(rig: Rig) -> bool:
-    return any(pad.options.get("accept_silent_pad") is True for pad in _page_pads(rig))
 
 
 def _group_message(spec: GroupSpec) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -306,10 +307,42 @@ def test_a_trip_ends_goals(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -
     rig.rearm()
 
 
-def test_edits_of_the_world_are_drawn(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
-    def told(method: str, **params: object) -> None:
-        viewer.note_edit(method, params, int(rig._hosts[0].request(f"world.{method}", params)))
+def edit(rig: hal.Rig, viewer: ViserViewer, method: str, **params: object) -> None:
+    """Edit the world, as ``rig.world`` does for the viewer that the rig was opened with."""
+    viewer.note_edit(method, params, int(rig._hosts[0].request(f"world.{method}", params)))
 
+
+def test_forces_on_the_arm_are_arrows_at_its_contacts(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    """They point out of what the fingers hold, into the fingers, and end with the contact."""
+    arm = rig.robots["panda"]
+    arm.gripper.open()
+    x, y, z = (arm.base @ arm.state(max_age=2.0).tcp).position.tolist()
+    block = BodySpec("block", (x, y, z), (0, 0, 0, 1), "box", half_extents=(0.02, 0.02, 0.02))
+    edit(rig, viewer, "add", spec=hal.specs.to_json(block))
+    try:
+        arm.gripper.grip(1.0)
+
+        def drawn() -> bool:
+            page.hear()
+            node, contacts = page.nodes.get("/forces", {}), rig.world.contacts("panda")
+            if not node.get("visible") or "points" not in node or not contacts:
+                return False
+            starts, ends = node["points"].reshape(-1, 2, 3).transpose(1, 0, 2)
+            ways = ends - starts
+            assert np.abs(starts - (x, y, z)).max() < 0.03, "at the block"
+            assert (ways[:, 1] * (starts[:, 1] - y) > 0.0).all(), "out of it"
+            lengths, force = np.linalg.norm(ways, axis=1), sum(contact.force for contact in contacts)
+            return bool(abs(lengths.sum() - 0.005 * force) < 0.1 * 0.005 * force)
+
+        until(drawn)
+    finally:
+        arm.gripper.open()
+        edit(rig, viewer, "remove", name="block")
+    until(lambda: page.hear() or not page.nodes["/forces"]["visible"])
+
+
+def test_edits_of_the_world_are_drawn(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    told = partial(edit, rig, viewer)
     cube = "/bodies/cube/0"
     until(lambda: page.hear() or np.abs(np.subtract(page.nodes[cube]["position"], (0.0, -0.2, 0.7))).max() < 0.1)
     ball = BodySpec("ball", (0.2, 0.0, 0.9), (0, 0, 0, 1), "sphere", radius=0.03, mass=0.1, rgba=(0, 1, 0, 1))

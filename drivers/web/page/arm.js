@@ -64,48 +64,24 @@ class JointBar {
   }
 }
 
-/** The bars of all joints. */
-class Joints {
-  /** @param {Plot} plot shows a joint that is clicked */
-  constructor(plot) {
-    this.plot = plot;
-    /** @type {JointBar[]} */
-    this.rows = [];
-    plot.chosen = () => this.rows.forEach((row, k) => setAttribute(row.button, "aria-pressed", String(k === plot.joint)));
-  }
-
-  /** Lay out the bars of an arm. @param {any} robot of hello */
-  open(robot) {
-    const scale = [Math.min(...robot.lower), Math.max(...robot.upper)];
-    this.rows = robot.joints.map((/** @type {string} */ name, /** @type {number} */ k) => {
-      const [lower, upper, short] = [robot.lower[k], robot.upper[k], shortened(name, robot.joints)];
-      return new JointBar(short, k, lower, upper, scale, () => this.plot.choose(this.plot.joint === k ? null : k));
-    });
-    byId("joints").replaceChildren(...this.rows.map((row) => row.element));
-  }
-
-  /** @param {any} robot of a state @param {string} unit */
-  show(robot, unit) {
-    this.rows.forEach((row, k) => row.show(robot.q[k], robot.q_set[k], unit));
-  }
-}
-
 const UNIT_KEY = "hal-console-unit";
 const WINDOW = 2; // s over which the servo's rate is counted
 const OLD = 500; // ms
 
 /** Measures the rate of a host's ticks. */
 class Rate {
+  /** ticks/s; null while unknown. @type {number | null} */
+  value = null;
   /** @type {[number, number][]} */ #seen = [];
 
-  /** @param {number} t s @param {number} ticks @returns {number | null} ticks/s */
+  /** @param {number} t s @param {number} ticks */
   add(t, ticks) {
     const seen = this.#seen;
     if (seen.length && ticks < seen[seen.length - 1][1]) seen.length = 0;
     seen.push([t, ticks]);
     while (t - seen[0][0] > WINDOW) seen.shift();
     const [[t0, first]] = seen;
-    return t - t0 > WINDOW / 4 ? (ticks - first) / (t - t0) : null;
+    this.value = t - t0 > WINDOW / 4 ? (ticks - first) / (t - t0) : null;
   }
 }
 
@@ -113,14 +89,14 @@ class Rate {
 export class ArmPanel {
   constructor() {
     this.plot = new Plot();
-    this.joints = new Joints(this.plot);
+    /** @type {JointBar[]} */
+    this.rows = [];
+    this.plot.chosen = () => this.rows.forEach((row, k) => setAttribute(row.button, "aria-pressed", String(k === this.plot.joint)));
     /** @type {any[]} */
     this.robots = [];
     this.name = "";
     /** @type {Map<string, Rate>} */
     this.rates = new Map();
-    /** @type {Map<string, number | null>} */
-    this.measured = new Map();
     /** Called with the name of an arm that was clicked. @type {(name: string) => void} */
     this.picked = () => {};
     byId("copy").addEventListener("click", () => this.#copy());
@@ -178,8 +154,18 @@ export class ArmPanel {
     choose(byId("robots"), name);
     setText(byId("model"), robot.name);
     byId("model").title = `${robot.name}: ${robot.model}, ${robot.driver}, ${robot.real ? "a real arm" : "simulated"}`;
-    this.joints.open(robot);
+    this.#layOut(robot);
     this.plot.open(robot.joints);
+  }
+
+  /** Lay out the bars of an arm's joints. @param {any} robot of hello */
+  #layOut(robot) {
+    const scale = [Math.min(...robot.lower), Math.max(...robot.upper)];
+    this.rows = robot.joints.map((/** @type {string} */ name, /** @type {number} */ k) => {
+      const [lower, upper, short] = [robot.lower[k], robot.upper[k], shortened(name, robot.joints)];
+      return new JointBar(short, k, lower, upper, scale, () => this.plot.choose(this.plot.joint === k ? null : k));
+    });
+    byId("joints").replaceChildren(...this.rows.map((row) => row.element));
   }
 
   /** Add a state to the plot and to the rates. @param {any} state */
@@ -194,7 +180,7 @@ export class ArmPanel {
     for (const [name, host] of Object.entries(state.hosts ?? {})) {
       const rate = this.rates.get(name) ?? new Rate();
       this.rates.set(name, rate);
-      this.measured.set(name, rate.add(state.t, host.ticks));
+      rate.add(state.t, host.ticks);
     }
   }
 
@@ -212,7 +198,7 @@ export class ArmPanel {
     const there = robot && !robot.lost;
     setData(byId("facts"), "old", there && silent < OLD ? null : "");
     if (there) {
-      this.joints.show(robot, this.unit);
+      this.rows.forEach((row, k) => row.show(robot.q[k], robot.q_set[k], this.unit));
       const [x, y, z, ...turn] = robot.tcp;
       setText(byId("tcp"), `x ${signed(x, 3)}  y ${signed(y, 3)}  z ${signed(z, 3)} m`);
       const [roll, pitch, yaw] = angles(turn).map((angle) => signed(angle, 1));
@@ -232,7 +218,7 @@ export class ArmPanel {
     const names = Object.keys(hosts);
     return names.map((name) => {
       const host = hosts[name];
-      const rate = (this.measured.get(name) ?? host.rate_hz).toFixed(0);
+      const rate = (this.rates.get(name)?.value ?? host.rate_hz).toFixed(0);
       const silent = host.silent > 0.1 ? `, silent ${host.silent.toFixed(1)} s` : "";
       const called = names.length > 1 ? `${name} ` : "";
       return `${called}${rate} of ${host.rate_hz.toFixed(0)} Hz, ${host.missed} missed${silent}`;

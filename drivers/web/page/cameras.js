@@ -269,10 +269,6 @@ export class Cameras {
 
   #built = "?";
 
-  close() {
-    this.pictures.close();
-  }
-
   /** Ten times a second. */
   paint() {
     const now = performance.now();

@@ -132,10 +132,6 @@ export class Overlay {
     byId("again").addEventListener("click", again);
   }
 
-  hide() {
-    show(byId("overlay"), false);
-  }
-
   /**
    * @param {number} code the socket's close code @param {string} reason
    * @param {number | null} retry ms until the next try

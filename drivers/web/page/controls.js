@@ -302,11 +302,6 @@ export class Controls {
     }));
   }
 
-  /** Mark the gripper's present width on its slider. @param {number | null} place 0 open .. 1 closed */
-  mark(place) {
-    this.slider.mark(place);
-  }
-
   /** Release the gripper's slider because the program waits for it: it stays where it is and cannot be released by hand. */
   releaseGrip() {
     this.slider.forget();

@@ -110,7 +110,7 @@ const HANDLERS = {
     stateAt = performance.now();
     stopping.addState(state);
     connection.proved();
-    overlay.hide();
+    show(byId("overlay"), false);
     log.synchronise(state.t);
     recording.setTime(state.t);
     panel.addState(state);
@@ -166,7 +166,7 @@ connection.lost = (code, reason, retry) => {
   stateAt = -Infinity;
   lease.disconnected();
   recording.forget();
-  cameras.close();
+  cameras.pictures.close();
   retitle();
 };
 
@@ -238,7 +238,7 @@ setInterval(() => {
   const pages = state.pages;
   setText(byId("pages"), `${pages} page${pages === 1 ? "" : "s"}`);
   status.show(state.robots, settings.robot || panel.name, silence());
-  controls.mark(panel.closed(state));
+  controls.slider.mark(panel.closed(state));
   panel.paint(state, silence());
 }, REPAINT);
 

@@ -100,18 +100,15 @@ export class Pad {
     this.home = null;
     /** @type {Source[]} */
     this.sources = [];
-    this.#holding = new Set();
-    this.#homing = new Set();
-    this.#taps = new Taps(() => this.update());
     /** Called after every change; `edge`: something was pressed or released. @type {((edge: boolean) => void)[]} */
     this.changed = [];
     /** Called by reset() to forget whatever is held. @type {(() => void)[]} */
     this.released = [];
   }
 
-  /** @type {Set<string>} */ #holding;
-  /** @type {Set<string>} */ #homing;
-  /** @type {Taps} */ #taps;
+  #holding = /** @type {Set<string>} */ (new Set());
+  #homing = /** @type {Set<string>} */ (new Set());
+  #taps = new Taps(() => this.update());
   /** Mask of the buttons that move nothing, and of those that do. */
   #moveless = 0;
   #shown = /** @type {Record<string, number[]>} */ ({});

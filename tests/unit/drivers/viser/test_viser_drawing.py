@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +17,7 @@ import trimesh
 from specs import data, panda
 
 from hal.commands import CHUNK_POINTS, Command, CommandRecord, JointChunk, Kind, SessionRecord, encode
+from hal.config import load
 from hal.config.data_files import find_data
 from hal.drivers.scene.shapes import Visual
 from hal.drivers.viser.meshes import visuals_glb
@@ -117,6 +121,30 @@ def test_workspace_is_drawn_at_its_bounded_sides() -> None:
     assert table.shape == (4, 2, 3)
     assert (table[..., 2] == np.float32(0.01)).all()
     assert len(workspace_lines(WorkspaceSpec((-10.0,) * 3, (10.0,) * 3))) == 0
+
+
+def test_a_camera_is_a_pyramid_where_it_sees_from() -> None:
+    """On the link that carries it; not at all if its pose is unknown."""
+    pytest.importorskip("viser", reason="needs viser (pip install 'robot-hal[viewer]')")
+    from hal.drivers.viser.scene import draw_cameras
+
+    nodes: dict[str, Any] = {}
+
+    def add(path: str, fov: float, aspect: float, **_: object) -> Any:
+        nodes[path] = SimpleNamespace(fov=fov, aspect=aspect, position=np.zeros(3), wxyz=np.array([1.0, 0.0, 0.0, 0.0]))
+        return nodes[path]
+
+    cameras = load("panda_table", sim=True).resolve().cameras
+    arm: Any = SimpleNamespace(spec=panda(), paths={"panda_hand": "/hand"})
+    scene: Any = SimpleNamespace(add_camera_frustum=add)
+    draw_cameras(scene, [*cameras, replace(cameras[0], name="lost", view=None)], [arm])
+    assert nodes.keys() == {"/cameras/scene", "/hand/wrist"}
+    for camera, node in zip(cameras, nodes.values(), strict=True):
+        assert camera.view is not None
+        assert node.position == pytest.approx(camera.view.position)
+        assert np.roll(node.wxyz, -1) == pytest.approx(camera.view.orientation)
+        assert 0.5 * camera.height / math.tan(node.fov / 2) == pytest.approx(camera.K[1][1])
+        assert node.aspect == pytest.approx(camera.width / camera.height, rel=0.01)
 
 
 def test_what_an_arm_goes_to_is_the_way_of_its_motion_or_the_points_of_its_newest_command() -> None:
