@@ -112,6 +112,27 @@ def test_targets_and_torques_are_cut_to_the_limits_with_a_reason(rig: hal.Rig, a
         assert sent.reasons == (f"torque limit of {arm.joints[0]}, {arm.joints[6]}",)
 
 
+def test_a_grip_that_was_sent_before_the_press_moves_nothing_after_it(rig: hal.Rig, arm: hal.Robot) -> None:
+    assert arm.gripper is not None
+    with arm.control(deadman=rig.gamepads["pad"].hold("l2")) as control:
+        rig.clock.sleep(0.05)
+        assert control.send(None, grip=1.0).reasons
+        press(rig)
+        rig.clock.sleep(0.3)
+        assert arm.gripper.state().width == pytest.approx(arm.gripper.width_max)
+        assert not control.send(None, grip=1.0).reasons
+        rig.clock.sleep(0.3)
+    assert arm.gripper.state().width < 0.9 * arm.gripper.width_max
+
+
+def test_the_first_target_of_a_chunk_is_the_one_that_is_due(rig: hal.Rig, arm: hal.Robot) -> None:
+    now, way = rig.clock.now(), np.array([0.0] * 6 + [0.3])
+    with arm.control() as control:
+        control.send(hal.JointChunk([now - 1.0, now + 1.0], [arm.home - way, arm.home + way]))  # home, now
+    with arm.control() as control, raises_code(CommandError, "first_step_too_far"):
+        control.send(hal.JointChunk([now - 1.0, now + 1.0], [arm.home + way, arm.home + way]))
+
+
 def test_limits_of_the_servo_are_among_the_reasons(rig: hal.Rig, arm: hal.Robot) -> None:
     with arm.control() as control:
         assert "tcp speed" in str(drive(rig, control, Twist([0, 0, 50.0]), 5)[-1].reasons)
@@ -128,7 +149,7 @@ def test_limits_of_the_servo_are_among_the_reasons(rig: hal.Rig, arm: hal.Robot)
         (lambda: Twist([0.1, 0.0]), "bad_command"),
         (lambda: Twist([0.1, 0.0, float("inf")]), "bad_command"),
         (lambda: hal.JointChunk([-2.0, -1.0], [[0.0] * 7] * 2), "chunk_in_the_past"),
-        (lambda: hal.JointChunk([1.0, 99.0], [[0.0] * 7] * 2), "chunk_too_long"),
+        (lambda: hal.JointChunk([1.0, 4.0], [[0.0] * 7] * 2), "chunk_too_long"),
         (lambda: "up", "not_a_command"),
         (lambda: hal.Pose([0.4, 0.0, 0.4]), "not_a_command"),
     ],

@@ -14,6 +14,7 @@ from errors_kit import raises_code
 
 import hal
 from hal import JointVelocity, MotionStopped, Trip
+from hal.commands import StopLatch
 from hal.host.records import AppRecord
 
 TURN = JointVelocity([0.2, 0, 0, 0, 0, 0, 0])
@@ -132,6 +133,15 @@ def test_a_press_for_another_trip_never_clears_a_stop(rig: hal.Rig, arm: hal.Rob
         assert control.trip is (Trip.FAULT if cause == "robot_fault" else Trip.STOP)
         causes.end(cause)
         assert_stopped(rig, control, press_again)
+
+
+def test_a_late_acknowledgement_of_an_earlier_stop_takes_no_newer_one_back() -> None:
+    latch = StopLatch()
+    for _ in range(2):
+        latch.stop()
+    for seen in (2, 1):
+        latch.acknowledge(seen)
+    assert not latch.stopped
 
 
 def test_the_rearm_of_one_arm_acknowledges_no_stop_for_another() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import socket
@@ -14,10 +15,12 @@ import pytest
 from errors_kit import raises_code
 
 from hal.commands import CHUNK_AHEAD, CommandRecord, DeadmanRecord, Kind, SessionRecord
+from hal.driver import PadReading
 from hal.errors import ConnectionLost
 from hal.host.records import GripperAct, GripperCommand, GroupMemory
 from hal.remote.boxes import boxes_of_program
 from hal.remote.link import MOST_ROUND_TRIP, ClockOffset, RigLink
+from hal.remote.pads import ReceivedReadings
 
 N = 7
 LONGEST = 0.3
@@ -242,3 +245,25 @@ def test_a_silent_end_is_gone(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(time, "monotonic", lambda: later)
     with raises_code(ConnectionLost, "link_silent"):
         ends.there.receive()
+
+
+def _arrive(reading: PadReading) -> ReceivedReadings:
+    """Let a reading arrive at 10 s, from a clock that is 2 s behind."""
+    box = ReceivedReadings()
+    box.take(1, json.dumps([reading, ["a pad"]]).encode(), 2.0, 10.0)
+    return box
+
+
+def test_a_pad_gives_no_sign_of_life_later_than_its_arrival() -> None:
+    for sent, arrived in ((7.0, 9.0), (9.0, 10.0)):
+        reading = _arrive(PadReading(sent, sent, 0.0, 1, {"l2": 1.0}, ["l2"], True)).reading  # type: ignore[arg-type]
+        assert reading is not None
+        assert (reading.t, reading.t_alive, reading.buttons) == (arrived, arrived, {"l2"})
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"t_alive": math.nan}, {"axes": {"l2": math.nan}}, {"connected": 1}, {"buttons": ["up"]}]
+)
+def test_a_reading_of_a_pad_that_makes_no_sense_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="a reading"):
+        _arrive(PadReading(1.0, 1.0, 0.0, 1, {}, [], True)._replace(**wrong))  # type: ignore[arg-type]

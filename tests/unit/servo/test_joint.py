@@ -87,6 +87,17 @@ def test_a_goal_is_reached_at_a_low_speed_of_the_tcp(tcp_speed, start, way):
     assert 0.9 * tcp_speed < fastest <= tcp_speed
 
 
+def test_a_moving_target_stands_still_after_its_deadline() -> None:
+    """The servo refuses the later commands, which are in time, and so keeps the target that came before."""
+    bench = Bench()
+    bench.target(PANDA_HOME, [0.2] + [0.0] * 6)
+    for _ in range(round(1.0 / bench.dt)):
+        bench.tick()
+        bench.send(Kind.JOINT_TARGET, [math.nan] * 2 * N)
+    assert bench.trip is Trip.NONE
+    assert 0.01 < bench.q[0] - PANDA_HOME[0] < 0.05  # 0.2 rad if it continued
+
+
 def test_already_there() -> None:
     bench = Bench(move_to=PANDA_HOME)
     bench.tick()

@@ -108,6 +108,28 @@ def test_a_press_while_the_device_is_lost_does_not_count() -> None:
     assert bench.trip is Trip.DEVICE_LOST
 
 
+def test_a_rearm_while_the_device_is_lost_does_not_count() -> None:
+    bench = Bench()
+    bench.drive()
+    bench.lose()
+    bench.rearm()
+    bench.lose()
+    bench.drive(0.5)
+    assert (bench.trip, bench.moving) == (Trip.DEVICE_LOST, False)
+    bench.rearm()
+    bench.drive()
+    assert bench.moving
+
+
+def test_a_command_of_another_session_does_not_extend_the_deadline() -> None:
+    bench = held()
+    for _ in range(round(0.2 / bench.dt)):
+        bench.send(Kind.JOINT_VELOCITY, [0.5] + [0.0] * 6)
+        bench.command = bench.command._replace(session=2)
+        bench.tick()
+    assert bench.trip is Trip.COMMAND_LATE
+
+
 @pytest.mark.parametrize("known_stops", [0, None], ids=["unknown to the app", "known to the app"])
 def test_a_stop_counts_unless_the_app_knew_of_it_before_the_session(known_stops: int | None) -> None:
     bench = Bench(begin=False)
