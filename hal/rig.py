@@ -263,9 +263,9 @@ class Rig:
                 self._local.pollers.append(gamepad.poll_once)
             else:
                 gamepad.start_thread(self.clock.now)
-            if chosen.input == "console" and self.console is not None:
-                # A program that waits for a dead-man would seem to hang. Apps print a banner instead.
-                logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
+        if self.console is not None and any(chosen.input == "console" for chosen in pads):
+            # A program that waits for a dead-man would seem to hang. Apps print a banner instead.
+            logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
 
     def _pad_source(self, chosen: Chosen) -> object | None:
         """Return the second argument of a gamepad driver: the console, this rig's stop, or the world's time."""
@@ -507,11 +507,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
     _check_leaders(plan, pads)
-    pages = [chosen for chosen in pads if chosen.input == "console" and not chosen.spec.hand]
-    for chosen in pages[1:]:
-        note = "the page is one pad, and drives one arm at a time; for the other, plug in a gamepad, or use a headset"
-        pads[pads.index(chosen)] = chosen._replace(notes=(*chosen.notes, f"{chosen.spec.name}: {note}"))
-    wrong = [
+    wrong = _check_pages(plan.source, pads) + [
         Problem("--pad", "", message, code)
         for chosen in pads
         for _, message, code in registry.check_record(chosen.spec.driver, chosen.spec.kind, chosen.spec)
@@ -529,6 +525,23 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
             )
         registry.load(registry.provider("console"), "console")
     return pads
+
+
+def _check_pages(source: str, pads: list[Chosen]) -> list[Problem]:
+    """Add a note to each further pad of the console's page; return the mistake of each further pad of the same hand."""
+    first: dict[str, str] = {}
+    problems = []
+    for place, chosen in enumerate(pads):
+        hand, name = chosen.spec.hand, chosen.spec.name
+        if chosen.input != "console" or first.setdefault(hand, name) == name:
+            continue
+        if hand:
+            message = f"is {hand}, as that of gamepads.{first[hand]}: one hand drives one arm; use the other hand"
+            problems.append(Problem(source, f"gamepads.{name}.options.hand", message, "same_hand"))
+            continue
+        note = "the page is one pad, and drives one arm at a time; for the other, plug in a gamepad, or use a headset"
+        pads[place] = chosen._replace(notes=(*chosen.notes, f"{name}: {note}"))
+    return problems
 
 
 def _check_leaders(plan: Plan, pads: Sequence[Chosen]) -> None:

@@ -215,8 +215,9 @@ def test_every_loss_of_the_hand_lets_go(bench: Bench, worn: Browser) -> None:
         undisturbed(bench, worn, partial(lose, what, happens, ends))
 
 
-def test_two_hands_drive_two_arms(two: Bench, browser: Browser, iwer: str) -> None:
+def test_two_hands_drive_two_arms(two: Bench, browser: Browser, iwer: str, caplog: pytest.LogCaptureFixture) -> None:
     """Each with a dead-man, a clutch and a gripper of its own."""
+    assert [record.name for record in caplog.get_records("setup")].count("hal.console") == 1, "the link, once"
     arms = {arm.robot.name: arm for arm in two.session.arms}
 
     def tcps() -> np.ndarray:

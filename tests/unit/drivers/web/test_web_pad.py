@@ -9,12 +9,15 @@ import pytest
 from errors_kit import raises_code
 
 from hal import registry
+from hal.config import load
 from hal.config.files import Problems
 from hal.config.models import load_pad_models
 from hal.driver import PadReading
 from hal.drivers.web.pad import PadQueue, WebPad, lost_reading, pad_reading
-from hal.errors import NotSupported
+from hal.errors import ConfigError, NotSupported
 from hal.gamepad import Gamepad
+from hal.pads.choice import Chosen
+from hal.rig import check_opening
 from hal.specs import PadSpec
 from hal.types import BUTTONS, PAGE_AXES
 
@@ -213,6 +216,26 @@ def test_a_hand_is_left_or_right() -> None:
     specs = [PadSpec("pad", "web", None, options=options) for options in ({}, {"hand": "left"}, {"hand": "middle"})]
     codes = [[code for *_, code in registry.check_record("web", "gamepad", spec)] for spec in specs]
     assert codes == [[], [], ["unknown_hand"]]
+
+
+def open_pads(first: dict[str, str], second: dict[str, str]) -> list[Chosen]:
+    """Check a rig of two arms that two pads of the page drive."""
+    bases = {"left": [0, 0.5, 0], "right": [0, -0.5, 0]}
+    arms = {name: {"model": "panda", "base": {"position": at}} for name, at in bases.items()}
+    pads = [{"driver": "web", "drives": arm, "options": it} for arm, it in zip(arms, (first, second), strict=True)]
+    rig = {"robots": arms, "gamepads": dict(zip(("first", "second"), pads, strict=True))}
+    return check_opening(load(rig, sim=True).resolve(), None, "none", False)
+
+
+def test_a_hand_drives_one_arm_and_the_page_one_at_a_time() -> None:
+    right = {"hand": "right"}
+    assert [pad.notes for pad in open_pads({}, right)] == [(), ()]
+    assert [len(pad.notes) for pad in open_pads({}, {})] == [0, 1]
+    with pytest.raises(ConfigError) as refused:
+        open_pads(right, right)
+    assert [(problem.key, problem.code) for problem in refused.value.problems] == [
+        ("gamepads.second.options.hand", "same_hand")
+    ]
 
 
 def test_a_lost_pad_has_nothing_pressed() -> None:
