@@ -119,6 +119,8 @@ class FrankaHand(GripperDriver):
             self._link.call(action.method, action.arguments)
         elif action is HandAction.STOP:
             self._link.stop()
+        elif action is HandAction.STOP_STRAY:
+            self._link.stop_stray()
         elif action is HandAction.RECONNECT:
             self._link.restart("the hand did not end a motion in spite of a stop")
 
@@ -147,7 +149,7 @@ class FrankaHand(GripperDriver):
         self._process_events()
 
     def stop(self) -> None:
-        """Stop the fingers; an object stays held."""
+        """Stop the fingers; without a connection, as soon as it is back. An object stays held."""
         self._require_open()
         self._controller.stop()
         self._process_events()

@@ -15,6 +15,9 @@ there; we have not seen it on a hand.) A width is therefore reached like this:
 The newest command replaces the one before. A running motion that does not serve it is stopped, and the next one begins
 when that motion has ended. Stops of this hand are known to be ignored, or to release an object, so the states after a
 stop are checked.
+
+The hand continues a motion whose client is lost. Such a stray motion is stopped on the next connection if a stop, or
+another command, came meanwhile, and only while the states show that the fingers move.
 """
 
 from __future__ import annotations
@@ -42,6 +45,8 @@ _SETTLE_TIME = 1.0
 """s after a stop within which the fingers must come to rest."""
 _AT_REST = 0.002
 """Speed below which the fingers are at rest, m/s."""
+_REST_TIME = 0.3
+"""s without motion after which the fingers count as at rest on a new connection."""
 _STOP_TIMEOUT = 2.0
 """s after a motion's bound within which a stop must have ended it; otherwise the connection is restarted."""
 
@@ -88,6 +93,11 @@ class EndedCall(NamedTuple):
     answer: CallAnswer
     stopped: bool
     """Whether a stop was sent for it."""
+
+
+def _is_pressing(call: GripperCall, state: HandState) -> bool:
+    """Return whether a motion is a grasp that presses on an object."""
+    return call.method == "grasp" and is_holding(state)
 
 
 def _move_call(state: HandState, width: float, speed: float) -> GripperCall:
@@ -296,6 +306,8 @@ def _answer_to(call: GripperCall, ended: EndedCall | None) -> CallAnswer | None:
 
 class HandAction(Enum):
     STOP = "stop"
+    STOP_STRAY = "stop stray"
+    """Stop a motion from before the present connection."""
     RECONNECT = "reconnect"
 
 
@@ -336,6 +348,14 @@ class HandController:
         self._t_ended = -math.inf
         """End of the last motion."""
         self._stop_check: _StopCheck | None = None
+        self._stray: _RunningCall | None = None
+        """Motion from before the present connection that may still run."""
+        self._ends_stray = False
+        """Whether a stop, or another command, ends it."""
+        self._outdated = False
+        """Whether the newest state is from before the connection was lost."""
+        self._t_moved = 0.0
+        """Time of the newest state in which the fingers moved, or of the first one of a connection, s."""
         self._force: float | None = None
         """Force (N) of the present grasp, if known."""
 
@@ -362,19 +382,25 @@ class HandController:
 
     def stop(self) -> None:
         """Stop the fingers; an object stays held."""
+        self._ends_stray = self._stray is not None
         if self._command is not None:
             self._command, self.outcome = None, GripperOutcome.STOPPED
 
     def _accept(self, command: HandCommand) -> None:
         self._command, self._ended = command, None
+        self._ends_stray = self._stray is not None
         self.outcome, self.fault = GripperOutcome.RUNNING, None
 
     # Events.
 
     def update(self, state: HandState) -> None:
         before, self.state = self.state, state
+        if self._outdated:
+            before, self._outdated, self.speed, self._t_moved = None, False, 0.0, state.t
         if before is not None and state.t_hand > before.t_hand:  # after a stall, states arrive in a bunch
             self.speed = (state.width - before.width) / (state.t_hand - before.t_hand)
+        if abs(self.speed) > _AT_REST:
+            self._t_moved = state.t
         if not state.is_grasped and state.t > self._t_ended:
             self._force = None
         if self._stop_check is not None and before is not None and before.t > self._stop_check.until:
@@ -403,7 +429,12 @@ class HandController:
                 self._stop_check = _StopCheck(now + _SETTLE_TIME, self.state.width, True)
 
     def connection_lost(self, reason: str) -> None:
-        """Fail the present command: nothing is sent a second time."""
+        """Fail the present command: nothing is sent a second time, but a stop."""
+        if self._running is not None:
+            self._stray, self._ends_stray = self._running, self._command is None or self._running.stopped_at is not None
+        if self._stray is not None:
+            self._stray.stopped_at = None
+        self._outdated = True
         self._running = self._ended = self._stop_check = self._force = None
         if self._command is not None:
             self._fail(_lost_fault(reason))
@@ -420,6 +451,12 @@ class HandController:
             return None
         if self._running is not None:
             return self._supervise(self._running, state, now)
+        if self._outdated:
+            return None
+        if self._stray is not None:
+            action = self._watch_stray(self._stray, state, now)
+            if self._stray is not None:
+                return action
         if self._command is None or state.t <= self._t_ended:
             return None  # no command, or the last state does not show the end of the last motion yet
         step = self._command.next(state, self._ended)
@@ -430,6 +467,21 @@ class HandController:
         self._running, self._stop_check = _RunningCall(step, now + step.bound), None
         return step
 
+    def _watch_stray(self, stray: _RunningCall, state: HandState, now: float) -> HandAction | None:
+        """Stop the stray motion if that is due; forget it when it is over, or holds an object."""
+        rests = state.t - self._t_moved > _REST_TIME
+        awaited = self._command is not None or stray.stopped_at is not None  # otherwise it may begin late
+        if _is_pressing(stray.call, state) or (rests and (awaited or now > stray.deadline)):
+            self._stray = None
+        elif self._ends_stray and stray.stopped_at is None and abs(self.speed) > _AT_REST:
+            return self._send_stop(stray, state, now, HandAction.STOP_STRAY)
+        return None
+
+    def _send_stop(self, running: _RunningCall, state: HandState, now: float, action: HandAction) -> HandAction:
+        running.stopped_at = now
+        self._stop_check = _StopCheck(now + _SETTLE_TIME, state.width, is_holding(state))
+        return action
+
     def _supervise(self, running: _RunningCall, state: HandState, now: float) -> HandAction | None:
         if running.stopped_at is not None:
             if now <= max(running.deadline, running.stopped_at) + _STOP_TIMEOUT:
@@ -439,11 +491,9 @@ class HandController:
         if now > running.deadline and self._command is not None and self._command.accepts(running.call, state):
             self._fail(_no_answer_fault(running.call.method, running.call.bound))
         # Without a command, only a grasp that presses on an object continues: a stop could release it.
-        serves = running.call.method == "grasp" and is_holding(state)
+        serves = _is_pressing(running.call, state)
         if self._command is not None:
             serves = self._command.accepts(running.call, state)
         if serves:
             return None
-        running.stopped_at = now
-        self._stop_check = _StopCheck(now + _SETTLE_TIME, state.width, is_holding(state))
-        return HandAction.STOP
+        return self._send_stop(running, state, now, HandAction.STOP)

@@ -21,7 +21,7 @@ from typing import Any, NoReturn, TypeAlias
 from hal.errors import ConnectionLost, Fault, HalError, NotSupported
 from hal.host.process import Channel, Child, SharedMemory, unpack_error
 
-from .faults import HAND_PORT, fault_of_exception
+from .faults import HAND_PORT, fault_of_exception, is_connection_lost
 from .hand_motions import CallAnswer, HandState
 
 _TARGET = "hal.drivers.franka.hand_process:main"
@@ -146,6 +146,11 @@ class HandLink:
         if self._pending:
             self._send("stop", ())
 
+    def stop_stray(self) -> None:
+        """Stop a motion that was begun on an earlier connection; while one of this connection runs, do nothing."""
+        if not self._pending:
+            self._send("stop", ())
+
     def _send(self, method: str, arguments: tuple[float, ...]) -> None:
         if self._child is not None:
             with contextlib.suppress(ConnectionLost):  # poll() notices it
@@ -237,7 +242,7 @@ class _HandThreads:
             threading.Thread(target=target, daemon=True).start()
 
     def request(self, number: int, method: str, arguments: list[float]) -> None:
-        """Start a motion, or stop the one with that number."""
+        """Start a motion, or stop the one with that number; 0 stands for one of an earlier connection."""
         if method == "stop":
             self._stops.put(number)
         else:
@@ -270,6 +275,9 @@ class _HandThreads:
             try:
                 answer: Any = bool(getattr(self._gripper, method)(*arguments))
             except RuntimeError as error:
+                if is_connection_lost(error):  # no answer of the hand: the motion may still run
+                    self._report({"silent": _explain(error, self._host)})
+                    os._exit(0)
                 fault = fault_of_exception(error, host=self._host, port=HAND_PORT)
                 answer = [fault.code, fault.cause, fault.remedy]
             self._running = 0

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
 
@@ -21,7 +22,9 @@ from hal.errors import CommandError, ConnectionLost, NotSupported
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
+from .franka_kit import Emulator
 from .hand_kit import LIMIT, HandBench
+from .rig_kit import arm_of, rig_of
 
 pytestmark = pytest.mark.pair
 
@@ -120,6 +123,43 @@ def test_a_connection_comes_back_but_not_the_command_that_it_cost(bench, brisk, 
     if how == "the hand restarts":
         fault = bench.do("move", 0.05, 0.1, 40.0).fault
         assert fault.code == "not_homed"
+
+
+@pytest.mark.slow
+def test_fingers_hear_a_stop_that_came_while_the_connection_was_lost():
+    """And what they have grasped meanwhile stays held. An emulated hand continues without a client."""
+    with (
+        Emulator("--lockstep", hand=True) as emulator,
+        rig_of(emulator.host, "fr3", "robots.arm.gripper.enabled=true") as rig,
+    ):
+        gripper = arm_of(rig).gripper
+
+        def hand(words: str = "state") -> dict:
+            return emulator.control.send(f"hand {words}")
+
+        def stop_unheard(connections: int) -> None:
+            wait_until(lambda: hand()["motion"], "moving")
+            hand("drop")
+            rig.stop()
+            wait_until(lambda: gripper.trouble, "lost")
+            wait_until(lambda: hand()["requests"]["connect"] == connections and not gripper._mail.get().lost, "back")
+            rig.rearm()
+            width = -1.0
+            while width != (width := gripper.state().width):
+                rig.clock.sleep(0.5)
+
+        hand("object 0.036")
+        gripper.start_grasp(0.036, speed=0.005)
+        stop_unheard(2)
+        assert hand()["is_grasped"]
+        assert hand()["requests"]["stop"] == 0
+        assert hand("object none")["width"] <= 0.036
+        wait_until(lambda: hand()["width"] == 0.0, "pressing")
+        gripper.start(0.08, speed=0.004)
+        stop_unheard(3)
+        assert hand()["motion"] is None
+        assert hand()["width"] == gripper.state().width < 0.075
+        assert gripper.move(0.06).width == pytest.approx(0.06, abs=2e-3)
 
 
 def test_closing_leaves_alone_what_is_held(bench):

@@ -52,6 +52,7 @@ class Bench:
     now: float = 0.0
     calls: list[GripperCall] = field(default_factory=list)
     stops: int = 0
+    stray_stops: int = 0
     reconnects: int = 0
     narrowest: float = 1.0
     """Smallest width of the fingers, m."""
@@ -62,8 +63,15 @@ class Bench:
         self.controller = HandController(WidthRange(0.08, 0.002))
         self._waiting = False
         self._mail: list[tuple[float, GripperCall | HandAction]] = []
-        self._next_state = 0.0
+        self._t_moved = 0.0
+        self._next_state = self._back_at = 0.0
         self.pass_time(self.period)
+
+    def lose(self, seconds: float) -> None:
+        """Cut the connection for a time; the hand goes on with what has reached it."""
+        self._waiting, self._mail = False, []
+        self._back_at = self.now + seconds
+        self.controller.connection_lost("the cable was pulled")
 
     def pass_time(self, seconds: float) -> None:
         for _ in range(round(seconds / DT)):
@@ -82,14 +90,22 @@ class Bench:
                 pressing = self.calls[-1].method == "grasp" and is_holding(self.controller.state)
                 assert self.controller.moving or not pressing, "a stop for what is held"
                 self.stops += 1
+            elif order is HandAction.STOP_STRAY:
+                assert not self._waiting
+                assert self.now - self._t_moved < 0.3 + self.delay, "a stop for fingers at rest"
+                assert not self.fingers.is_grasped, "a stop for what is held"
+                self.stray_stops += 1
             else:
                 self.reconnects += 1
-                self._waiting, self.fingers.motion, self._mail = False, None, []
+                self.lose(1.0)
                 continue
             self._mail.append((self.now + self.delay, order))
 
     def _hand(self) -> None:
+        before = self.fingers.width
         status = self.fingers.advance(DT)
+        if self.fingers.width != before:
+            self._t_moved = self.now
         self.narrowest = min(self.narrowest, self.fingers.width)
         self.widest = max(self.widest, self.fingers.width)
         while self._mail and self._mail[0][0] <= self.now:
@@ -101,6 +117,8 @@ class Bench:
             elif not self.deaf and self.fingers.motion is not None:
                 self.fingers.motion = None
                 status = HandStatus.ABORTED
+        if self.now < self._back_at:
+            return
         if self.now >= self._next_state:
             self._next_state += self.period
             f = self.fingers
@@ -378,12 +396,60 @@ def test_a_motion_without_an_answer_is_ended(bench):
 def test_a_command_is_lost_with_the_connection_and_never_sent_again(bench):
     bench.controller.move(0.08, 0.05, 40.0)
     bench.pass_time(0.1)
-    bench.controller.connection_lost("the cable was pulled")
+    bench.lose(0.5)
     assert bench.controller.outcome is GripperOutcome.FAILED
     assert (bench.controller.fault.code, bench.controller.fault.cause) == ("lost", "the cable was pulled")
-    bench.fingers.motion = None
-    bench.pass_time(1.0)
+    bench.pass_time(5.0)
     assert len(bench.calls) == 1
+    assert (bench.stops, bench.stray_stops, bench.fingers.width) == (0, 0, 0.08)
+
+
+@pytest.mark.parametrize("when", ["before", "while", "after"])
+def test_a_stop_that_the_loss_of_the_connection_kept_from_the_hand_is_sent_again(bench, when):
+    bench.controller.move(0.08, 0.02, 40.0)
+    bench.pass_time(0.1)
+    if when == "before":
+        bench.deaf = True
+        bench.controller.stop()
+        bench.pass_time(0.05)
+    bench.lose(0.5)
+    if when == "while":
+        bench.controller.stop()
+    bench.deaf = False
+    bench.pass_time(0.7)
+    if when == "after":
+        bench.controller.stop()
+    bench.pass_time(0.1)
+    width = bench.fingers.width
+    bench.pass_time(5.0)
+    assert bench.fingers.width == width < 0.06
+    assert bench.stray_stops == 1
+    assert bench.do("move", 0.07, 0.1, 40.0) is GripperOutcome.DONE
+
+
+def test_a_command_after_a_lost_connection_first_stops_what_still_runs(bench):
+    bench.controller.move(0.08, 0.01, 40.0)
+    bench.pass_time(0.1)
+    bench.lose(0.5)
+    bench.pass_time(0.6)
+    assert bench.do("move", 0.02, 0.1, 40.0) is GripperOutcome.DONE
+    assert bench.stray_stops == 1
+    assert bench.widest < 0.06
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_what_was_grasped_while_the_connection_was_lost_gets_no_stop(bench, again):
+    bench.fingers.put(0.03)
+    bench.controller.move(0.0, 0.05, 40.0)
+    bench.pass_time(0.1)
+    bench.lose(1.0)
+    bench.controller.stop()
+    if again:
+        bench.pass_time(0.5)
+        bench.lose(0.5)
+    bench.pass_time(5.0)
+    assert (bench.stops, bench.stray_stops) == (0, 0)
+    assert (bench.fingers.is_grasped, bench.fingers.width) == (True, 0.03)
 
 
 @pytest.mark.parametrize("seed", range(100))
@@ -410,6 +476,8 @@ def test_random_commands_come_to_an_end(seed):
             controller.stop()
         elif act < 0.9:
             controller.home()
+        elif act < 0.93:
+            bench.lose(dice.choice([0.1, 1.0]))
         else:
             fingers.put(dice.choice([None, fingers.width]) if fingers.width > 0.0 else None)
         bench.pass_time(dice.choice([0.01, 0.05, 0.3]))
