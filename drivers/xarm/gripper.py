@@ -61,6 +61,10 @@ class XArmGripper(GripperDriver):
         self._failed: Fault | None = None
         """Why the newest command failed."""
         self._t_moved = self._t_tried = -inf
+        self._still_at: int | None = None
+        """Position from which on it has not moved; None after it did not answer: it may have moved meanwhile."""
+        self._t_back = -inf
+        """When it answered again, s."""
 
     def open(self) -> None:
         """Connect, and ask for its position. Nothing moves."""
@@ -76,7 +80,7 @@ class XArmGripper(GripperDriver):
     def close(self) -> None:
         """Stop moving fingers, keep a grasp, and disconnect. Idempotent."""
         try:
-            if self._api is not None:
+            if self._api is not None and self._is_moving(monotonic()):
                 self.stop()
         except ConnectionLost:
             pass
@@ -88,16 +92,15 @@ class XArmGripper(GripperDriver):
 
     def read(self, now: float) -> GripperReading:
         offset = now - monotonic()
-        began, before = monotonic(), self._position
+        began = monotonic()
         self._ask()
         self._seq += 1
-        if abs(self._position - before) > 1:
-            self._t_moved = began
         fault = gripper_fault(self._error) if self._error else None
         if fault is not None:
             self._fail(fault)
+            self._goal = None
         width = min(self.spec.width_max, max(0.0, self.spec.width_at(self._position / _OPEN)))
-        moving = self._is_moving(began)
+        moving = self._is_moving(began) or (self._goal is not None and began - self._t_back < _REST)
         return GripperReading(
             t=began + offset,
             t_device=began,
@@ -105,7 +108,7 @@ class XArmGripper(GripperDriver):
             width=width,
             width_target=width if self._target is None else self._target,
             moving=moving,
-            grasped=self._goal is not None and not moving and self._position - max(0, self._goal) > _NEAR,
+            grasped=self._on and self._goal is not None and not moving and self._position - max(0, self._goal) > _NEAR,
             outcome=None if self._failed is None else GripperOutcome.FAILED,
             fault=self._failed or fault,
         )
@@ -118,13 +121,16 @@ class XArmGripper(GripperDriver):
         """Note that its motor may be off; a motion that was under way has failed."""
         if self._is_moving(monotonic()):
             self._failed = fault
-        self._on, self._goal = False, None
+        self._on, self._still_at = False, None
 
     def _reach(self) -> Any:
         """Return the SDK's calls. Raises ConnectionLost."""
         if not self._is_open:
             raise ConnectionLost(f"{self.spec.name} is not open", code="closed")
-        if self._api is None or not self._api.connected:
+        if self._api is not None and not self._api.connected:
+            self._api = self._still_at = None
+            raise ConnectionLost.of(self.spec.name, replace(NO_CONTROLLER, cause="it hung up"))
+        if self._api is None:
             now, host = monotonic(), self.settings.host
             why = "it hung up"
             if now - self._t_tried > _RETRY:
@@ -150,6 +156,10 @@ class XArmGripper(GripperDriver):
     def _ask(self) -> None:
         core = self._reach()
         (self._position,) = self._check(core.gripper_modbus_get_pos())
+        if self._still_at is None:
+            self._still_at, self._t_back = self._position, monotonic()
+        elif abs(self._position - self._still_at) > 1:
+            self._still_at, self._t_moved = self._position, monotonic()
         (self._error,) = self._check(core.gripper_modbus_get_errcode())
 
     # Commands.
@@ -157,10 +167,10 @@ class XArmGripper(GripperDriver):
     def move(self, width: float, speed: float, force: float) -> None:
         """Move the fingers to ``width`` (m), or until they meet something, which they hold with their own force."""
         self._target = min(max(width, 0.0), self.spec.width_max)
-        self._goal = self._failed = None
+        self._failed = None
         self._ask()
         if self._error:
-            self._failed = gripper_fault(self._error)
+            self._failed, self._goal = gripper_fault(self._error), None
             return
         share = 1.0 if width >= self.spec.width_max else self.spec.travel_at(self._target)
         goal = _BEYOND if width <= self.spec.width_min else round(_OPEN * share)
@@ -178,13 +188,19 @@ class XArmGripper(GripperDriver):
         self._check(self._reach().gripper_modbus_clean_err())
 
     def stop(self) -> None:
+        """Stop the fingers if they were seen to move: a gripper that holds would let go.
+
+        Raises:
+            ConnectionLost: It does not answer; after that it takes some readings to see whether they move.
+        """
+        self._ask()
         if self._is_moving(monotonic()):
-            self._ask()
             self._send(self._position)
 
     def _send(self, goal: int) -> None:
-        self._check(self._reach().gripper_modbus_set_pos(goal))
-        self._goal, self._t_moved = goal, monotonic()
+        core = self._reach()
+        self._goal, self._t_moved = goal, monotonic()  # the gripper may take it although the answer is lost
+        self._check(core.gripper_modbus_set_pos(goal))
 
 
 def check(spec: GripperSpec, duration: float) -> Iterator[CheckResult]:

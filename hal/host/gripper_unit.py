@@ -14,6 +14,9 @@ from .records import AppRecord, GripperAct, GripperCommand, GripperMail
 
 AT_WIDTH = 0.001
 """Largest distance from the target at which fingers at rest have reached it, m."""
+_REPEAT = 0.5
+"""s for which a stop of a gripper that did not answer is given again once it does: its driver learns late what moves.
+"""
 _SWITCH_ON = "check that it is on and connected"
 
 
@@ -31,8 +34,8 @@ class GripperUnit:
         self.spec = driver.spec
         self.mail = mail
         self._reading: GripperReading | None = None
-        self._moving = False
-        """Whether the fingers move; False while the gripper does not answer."""
+        self._moving = self._lost = False
+        """Whether the fingers moved in the last reading, and whether the gripper did not answer instead."""
         self._command: GripperCommand | None = None
         self._force = self.spec.force
         """Force of the newest motion, N."""
@@ -45,6 +48,8 @@ class GripperUnit:
         self._fault: Fault | None = None
         """Fault of the newest command, if its call failed."""
         self._stops = 0
+        self._unheard: float | None = None
+        """Until when the last stop is given again, s: infinite until the gripper answers, None if it heard the stop."""
         self._waiting: tuple[int, float] = (0, 0.0)
         """Number of the newest command whose session did not move yet, and when it was seen first, s."""
         self._reason = ""
@@ -99,9 +104,10 @@ class GripperUnit:
         return is_alive(now, app.t) and command.session in (0, self._allowed_session(now))
 
     def end_motion(self) -> None:
-        """Stop the fingers if they move, also those whose command has failed; they keep what they hold."""
+        """Stop the fingers if they may move, also those whose command has failed; they keep what they hold."""
         running = self._outcome is GripperOutcome.RUNNING
-        if running or (self._outcome is GripperOutcome.FAILED and self._moving):
+        failed = self._outcome is GripperOutcome.FAILED and (self._moving or self._lost)
+        if running or (failed and self._unheard is None):
             self._stop(running)
 
     def _take(self, command: GripperCommand) -> None:
@@ -121,14 +127,19 @@ class GripperUnit:
                 self.driver.home()
         except Exception as error:
             self._fail(error)
+        else:
+            self._unheard = None
 
     def _stop(self, ends: bool) -> None:
         """Stop the fingers. ``ends``: whether the newest command is still running."""
         try:
             self.driver.stop()
         except Exception as error:
+            self._unheard = math.inf
             self._fail(error)
         else:
+            if self._lost:
+                self._unheard = math.inf
             if ends:
                 self._end(GripperOutcome.STOPPED)
 
@@ -160,9 +171,19 @@ class GripperUnit:
         else:
             self._reading, self._moving = reading, reading.moving
             self._judge(reading)
+            self._repeat_stop(now)
+        self._lost = lost is not None
         if self._reading is not None:
             fault = self._fault or lost or self._reading.fault
             self.mail.put(self._reading, self._seq, self._outcome, fault, lost is not None, self._force)
+
+    def _repeat_stop(self, now: float) -> None:
+        if self._unheard is not None:
+            self._unheard = min(self._unheard, now + _REPEAT)
+            if now < self._unheard:
+                self._stop(False)
+            else:
+                self._unheard = None
 
     def _judge(self, reading: GripperReading) -> None:
         """Decide how the newest command goes: by the driver's outcome, or else by the width."""

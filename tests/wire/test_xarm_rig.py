@@ -168,6 +168,42 @@ def test_the_gripper_holds_names_its_faults_and_moves_again(emulator: XArmEmulat
         assert gripper.move(0.02).width == pytest.approx(0.02, abs=2e-3)
 
 
+def test_a_gripper_hears_a_stop_that_came_while_it_did_not_answer(emulator: XArmEmulator) -> None:
+    rig, control = emulator.rig(), emulator.control
+    rig["robots"]["arm"]["gripper"] = {"model": "xarm_gripper"}
+    with hal.open(rig) as opened:
+        arm = opened.robots["arm"]
+        gripper = arm.gripper
+        assert gripper is not None
+
+        def stop_unheard() -> None:
+            control.send("gripper off")
+            wait_until(lambda: gripper.trouble, "it is lost")
+            opened.stop()
+            wait_code(arm, "C19")
+
+        def answer() -> None:
+            control.send("gripper on")
+            opened.rearm()
+            recover(opened, arm)
+            wait_until(lambda: not gripper._mail.get().lost, "it answers")
+            width = -1.0
+            while width != (width := emulator.status()["width"]):
+                opened.clock.sleep(0.6)
+
+        gripper.start(0.0, speed=0.008)
+        wait_until(lambda: gripper.state().width < 0.084, "it moves")
+        stop_unheard()
+        answer()
+        assert emulator.status()["width"] > 0.02
+        control.send("object 0.03")
+        assert gripper.grasp(0.03)
+        stop_unheard()
+        answer()
+        control.send("object none")
+        emulator.wait_for(lambda status: status["width"] < 0.01)  # it still presses
+
+
 @pytest.mark.parametrize("robot", ["xarm5", "lite6"])
 def test_other_arms_are_driven_by_their_models(robot: str) -> None:
     other = XArmEmulator("--robot", robot, model=robot)

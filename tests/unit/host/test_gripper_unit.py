@@ -252,7 +252,8 @@ def test_fingers_that_move_although_their_command_failed_are_stopped(bench: Benc
     bench.report()
     assert bench.outcome(moving=False) is GripperOutcome.FAILED
     bench.report()
-    assert [call[0] for call in bench.driver.calls] == ["move", "stop", "stop"], "one per cycle in which they moved"
+    stops = [call[0] for call in bench.driver.calls][1:]
+    assert stops == ["stop"] * 5, "one while they moved, one while it does not answer, and then one in each cycle"
 
 
 def test_a_motion_ends_when_its_session_may_not_move_any_more(bench: Bench) -> None:
@@ -291,6 +292,46 @@ def test_a_stop_that_fails_is_told(bench: Bench) -> None:
     state = bench.report().state
     assert state.outcome is GripperOutcome.FAILED
     assert state.fault.cause == "it does not stop"
+
+
+@pytest.mark.parametrize("raises", [True, False])
+@pytest.mark.parametrize("how", ["the rig", "the session", "a command"])
+def test_a_stop_that_a_lost_gripper_does_not_hear_is_given_again(bench: Bench, how: str, raises: bool) -> None:
+    bench.session = bench.allowed = 7
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    bench.report(moving=True)
+    bench.driver.deaf = ConnectionLost("the cable")
+    bench.driver.error = bench.driver.deaf if raises else None
+    bench.turn()
+    if how == "the rig":
+        bench.stops += 1
+    elif how == "the session":
+        bench.allowed = 0
+    else:
+        bench.tell(GripperAct.STOP)
+    for _ in range(3):
+        bench.report()
+    assert len(bench.driver.calls) == 2, "a gripper that does not answer is asked once"
+    bench.driver.deaf = bench.driver.error = None
+    bench.allowed = 7
+    for _ in range(100):
+        assert bench.outcome(moving=False) is (GripperOutcome.FAILED if raises else GripperOutcome.STOPPED)
+    stops = len(bench.driver.calls) - 2
+    assert 40 < stops < 60, "for half a second, until the driver has seen what moves"
+
+
+def test_a_newer_command_takes_the_place_of_a_stop_that_was_not_heard(bench: Bench) -> None:
+    bench.report()
+    bench.driver.error = ConnectionLost("the cable")
+    bench.tell(GripperAct.STOP)
+    bench.report()
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    bench.report()
+    bench.driver.error = None
+    bench.tell(GripperAct.MOVE, 0.03, 0.05, 10.0)
+    bench.report(moving=True)
+    calls = [call[0] for call in bench.driver.calls]
+    assert calls == ["stop", "stop", "move", "stop", "move"], "a command that fails does not"
 
 
 def test_an_error_at_opening_says_how_to_do_without_it(bench: Bench) -> None:
