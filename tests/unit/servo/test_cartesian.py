@@ -179,12 +179,14 @@ ROOM = WorkspaceSpec((0.0, -0.3, 0.2), (0.5, 0.3, 0.7))
     [
         (Kind.TWIST, [0.25, 0.1, 0.0, 0, 0, 0, 0], BOX, 0.4, 0, True),
         (Kind.TWIST, [0.0, 0.0, -0.25, 0, 0, 0, 0], BOX, 0.3, 2, True),
+        (Kind.TWIST, [-0.25, 0.0, 0.0, 0, 0, 0, 0], BOX, 0.25, 0, True),
         (Kind.JOINT_VELOCITY, [0.8, 0, 0, 0, 0, 0, 0], BOX, 0.1, 1, True),
         (Kind.JOINT_VELOCITY, [0, 0.8, 0, 0.8, 0, 0, 0], BOX, 0.4, 0, True),
         # The slow-down before the faces does not suffice here; the check of where the stop would end must act.
         (Kind.JOINT_VELOCITY, [1.5, 0, 0, 0, 0, 0, 0], ROOM, 0.3, 1, False),
         (Kind.JOINT_VELOCITY, [-1.5, 0, 0, 0, 0, 0, 0], ROOM, -0.3, 1, False),
         (Kind.JOINT_VELOCITY, [0, 1.5, 0, 1.0, 0, 0, 0], ROOM, 0.5, 0, False),
+        (Kind.JOINT_VELOCITY, [0, -1.0, 0, 1.0, 0, 0, 0], ROOM, 0.7, 2, False),
     ],
 )
 def test_the_workspace_is_never_left(

@@ -418,6 +418,16 @@ def test_nothing_is_taken_for_far_after_a_change(panda: RobotSpec, what: str) ->
     assert not stops.propose(*changed[what])
 
 
+def test_an_arm_slows_down_for_another_one_that_comes_nearer(panda: RobotSpec) -> None:
+    other = replace(panda, name="other", base_position=(1.2, 0.0, 0.0), base_orientation=(0.0, 0.0, 1.0, 0.0))
+    stops, goal = Stops(panda, (), other), [0.0, 0.5, *[0.0] * 5]
+    stops.smoother.anchor(list(OVER_THE_TABLE))
+    assert stops.guard.slow(goal) == goal
+    stops.elsewhere[1] = np.add(other.home, [0.0, 0.3, 0.0, 0.15, 0.0, 0.15, 0.0])
+    assert stops.room(OVER_THE_TABLE, 1.0) > 0.1, "it stops far enough away for every step to be allowed"
+    assert stops.guard.slow(goal)[1] < 0.5 * goal[1]
+
+
 @pytest.mark.parametrize("moved", [False, True])
 def test_another_arm_is_not_taken_for_far_after_it_moved_or_set_off(panda: RobotSpec, moved: bool) -> None:
     other = replace(panda, name="other", base_position=(1.2, 0.0, 0.0), base_orientation=(0.0, 0.0, 1.0, 0.0))
