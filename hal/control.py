@@ -289,6 +289,10 @@ class Control:
         self._note_stops(servo)
         return servo.trip
 
+    def check(self) -> None:
+        """Raise MotionStopped, RobotFault or ControlTaken, as :meth:`send` would now; send nothing."""
+        self._check_trip(self._peek())
+
     def _note_stops(self, servo: ServoRecord) -> None:
         """Note that the caller sees this trip: :meth:`rearm` acknowledges no later stop."""
         if servo.trip is Trip.STOP:

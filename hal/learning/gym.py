@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -304,8 +305,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             ``rig.world.randomize``, if the rig varies.
 
         Raises:
-            MotionStopped: After ``rig.stop()``. Only the operator, or a program that is responsible for safety, may
-                call ``env.rig.rearm()``.
+            MotionStopped: After ``rig.stop()``, until :meth:`rearm`.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -379,29 +379,44 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         if numbers.shape != (count := (sum(arm.size for arm in self._arms),)):
             raise CommandError(f"an action has shape {count}, not {numbers.shape}", code="bad_action")
         clock = self.rig.clock
-        stopped, first = "", 0
+        stops, first = [], 0
         for arm in self._arms:
             if arm.control is None:
                 raise CommandError("call reset before step", code="not_reset")
             command, grip = arm.command(numbers[first : first + arm.size])
             first += arm.size
-            try:
-                arm.control.send(command, grip=grip)
-            except (MotionStopped, RobotFault) as stop:
-                reason = stop.reason if isinstance(stop, MotionStopped) else stop.cause
-                stopped = stopped or (f"{arm.robot.name}: {reason}" if len(self._arms) > 1 else reason)
+            stops += self._list_stops(arm, partial(arm.control.send, command, grip=grip))
         now = clock.now()
         self._due = max(self._due + 1.0 / self.settings.rate_hz, now)  # a late turn is not caught up
         clock.sleep_until(self._due)
+        for arm in self._arms:
+            assert arm.control is not None
+            stops += self._list_stops(arm, arm.control.check)
         observation = self.rig.observe(after=self._find_oldest(now), cameras=self._cameras)
         self._steps += 1
         shown, most = self._observation_dict(observation), self.settings.max_steps
         terminated, reward = bool(self.success()), float(self.reward())
-        truncated = bool(stopped) or (most is not None and self._steps >= most)
+        truncated = bool(stops) or (most is not None and self._steps >= most)
         info = self._info(observation)
-        if stopped:
-            info["stopped"] = stopped
+        if stops:
+            info["stopped"] = stops[0]
         return shown, reward, terminated, truncated, info
+
+    def _list_stops(self, arm: _EnvArm, call: Callable[[], object]) -> list[str]:
+        """Return why a call to the session of an arm finds it stopped; empty if it does not."""
+        try:
+            call()
+        except (MotionStopped, RobotFault) as stop:
+            reason = stop.reason if isinstance(stop, MotionStopped) else stop.cause
+            return [f"{arm.robot.name}: {reason}" if len(self._arms) > 1 else reason]
+        return []
+
+    def rearm(self) -> None:
+        """Acknowledge ``rig.stop()``, so that :meth:`reset` drives again; in worlds of ``make_vec``: ``call("rearm")``.
+
+        Only the operator, or a program that is responsible for safety, may do so.
+        """
+        self.rig.rearm()
 
     def _find_oldest(self, sent: float) -> float | None:
         """Return the oldest time of an acceptable picture, s; None in lock-step, where all show the present.

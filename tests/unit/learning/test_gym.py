@@ -239,9 +239,10 @@ def test_a_stop_truncates_with_its_reason_and_a_reset_does_not_acknowledge_it() 
     try:
         env.reset()
         env.step(np.zeros(7, np.float32))
-        env.rig.stop()
-        env.rig.clock.sleep(0.05)
-        *_, truncated, info = env.step(np.zeros(7, np.float32))
+        late = env.rig.clock.now() + 0.02
+        stop = env.rig.clock.call_every(0.02, lambda: env.rig.clock.now() > late and env.rig.stop())
+        *_, truncated, info = env.step(np.zeros(7, np.float32))  # stopped after its action was sent
+        stop()
         assert truncated
         assert "rig.stop()" in info["stopped"]
         assert "control.rearm" not in info["stopped"], "an environment has no session to rearm"
@@ -250,7 +251,7 @@ def test_a_stop_truncates_with_its_reason_and_a_reset_does_not_acknowledge_it() 
             with raises_code(hal.MotionStopped, hal.Trip.STOP.code):
                 env.reset()
         assert env.robot.state().q == pytest.approx(before)
-        env.rig.rearm()
+        env.rearm()
         env.reset()
         *_, truncated, info = env.step(np.zeros(7, np.float32))
         assert not truncated
