@@ -144,6 +144,7 @@ class XArmGripper(GripperDriver):
                     why = str(error)
             if why:
                 raise ConnectionLost.of(self.spec.name, replace(NO_CONTROLLER, cause=why))
+        assert self._api is not None
         return self._api.core
 
     def _check(self, answer: list[int]) -> list[int]:

@@ -9,10 +9,8 @@ from servo_kit import Bench
 from specs import panda
 
 from hal.commands import Kind
+from hal.servo.watchdog import SILENCE
 from hal.types import RobotStatus, Trip
-
-PATIENCE = 0.15
-PAD_PATIENCE = 0.12
 
 
 def held() -> Bench:
@@ -199,7 +197,7 @@ def attended(**changes: object) -> Bench:
 def test_a_servo_that_could_not_run_trips_an_arm_that_really_moves() -> None:
     """The app, the pad and the device went on meanwhile: nothing but the pause itself tells."""
     bench = attended()
-    bench.now += PATIENCE
+    bench.now += SILENCE
     bench.drive(bench.dt)
     assert (bench.status, bench.trip) == (RobotStatus.TRIPPED, Trip.HOST_LATE)
     assert_only_a_new_press_continues(bench, Trip.HOST_LATE)
@@ -207,7 +205,7 @@ def test_a_servo_that_could_not_run_trips_an_arm_that_really_moves() -> None:
 
 def test_a_shorter_pause_and_one_in_which_nothing_may_move_are_no_trip() -> None:
     bench = attended()
-    bench.now += PATIENCE - 2.5 * bench.dt
+    bench.now += SILENCE - 2.5 * bench.dt
     bench.drive(bench.dt)
     assert bench.status is RobotStatus.FOLLOWING
     bench.release()
