@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 
@@ -13,19 +13,20 @@ BRIEF = 8.0
 """s until a try is given up; a page that is heard moves the arm within 0.2 s."""
 
 
-def undisturbed(bench: Bench, page: Browser, attempt: Callable[[], None]) -> None:
+def undisturbed(bench: Bench, page: Browser, attempt: Callable[[], None], losses: Sequence[str] = ()) -> None:
     """Do it, and anew where it failed while the machine was too busy for the page or the app to be heard in time.
 
     Then the arm has to stop, and a press does not count: that is no failure of what is tested here. Between two tries
-    everything is let go of.
+    everything is let go of. ``losses`` are what the page's log has where it lets go for that reason itself.
     """
     for turn in range(TRIES):
-        began = time.monotonic()
+        began, before = time.monotonic(), sum(lines(page, words) for words in losses)
         try:
             attempt()
             return
         except (AssertionError, pytest.fail.Exception):
-            if turn == TRIES - 1 or not disturbed(began):
+            lost = sum(lines(page, words) for words in losses) > before
+            if turn == TRIES - 1 or not (lost or disturbed(began)):
                 raise
         let_go_of_all(page)
         wait_until_released(bench)

@@ -6,8 +6,8 @@ import hashlib
 import shutil
 import subprocess
 import tarfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -42,6 +42,7 @@ if (self === top) {
       for (const name of ['squeeze', 'trigger']) one.updateButtonValue(name, 0);
     }
     hand.updateButtonValue('a-button', 0);
+    hand.quaternion.set(0, 0, 0, 1);
   };
   let tremble = 1e-5;
   const live = () => {
@@ -108,12 +109,22 @@ def wear(page: Browser) -> None:
     wait_for(lambda: page.text("#headset") == "Leave headset", "the session")
 
 
-def squeeze(bench: Bench, page: Browser, value: float = 1.0) -> None:
-    """Squeeze the controller, or release it, until the arm knows."""
-    if value:
-        wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad", BRIEF)
-    page.run(f"hand.updateButtonValue('squeeze', {value})")
-    wait_for(lambda: bench.deadman.held == bool(value), f"the squeeze {value}", BRIEF)
+def squeeze(bench: Bench, page: Browser) -> None:
+    """Squeeze the right controller until the arm knows."""
+    wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad", BRIEF)
+    squeeze_anew(page, "right", lambda: bench.deadman.held)
+
+
+def squeeze_anew(page: Browser, side: str, held: Callable[[], bool]) -> None:
+    """Squeeze, and as a person does once more where a busy computer let go of it, until that counts."""
+    for _ in range(5):
+        page.run(f"hands.{side}.updateButtonValue('squeeze', 1)")
+        with suppress(pytest.fail.Exception):
+            wait_for(held, "the squeeze", 2.0)
+            return
+        page.run(f"hands.{side}.updateButtonValue('squeeze', 0)")
+        page.run(LATER, 400)
+    pytest.fail(f"no squeeze of the {side} hand counts")
 
 
 def rest(bench: Bench, page: Browser) -> None:
@@ -124,45 +135,8 @@ def rest(bench: Bench, page: Browser) -> None:
     page.run(f"return new Promise((done) => setTimeout(() => {two}, 250))")
 
 
-def test_the_arm_follows_the_hand_while_it_is_squeezed_and_never_jumps(bench: Bench, worn: Browser) -> None:
-    def drive() -> None:
-        rest(bench, worn)
-        before = bench.tcp.copy()
-        squeeze(bench, worn)
-        worn.run("return new Promise((done) => setTimeout(done, 250))")
-        assert abs(bench.tcp - before).max() < 1e-4, "a squeeze moves nothing"
-        for step, way in (((0, 0, -0.01), (0.1, 0, 0)), ((-0.01, 0, 0), (0, 0.1, 0)), ((0, 0.01, 0), (0, 0, 0.1))):
-            start = bench.tcp.copy()
-            glide(worn, step)
-            wait_for(lambda to=start + way: abs(bench.tcp - to).max() < 2e-3, f"the way {way}", BRIEF)
-        rest(bench, worn)
-        before = bench.tcp.copy()
-        glide(worn, (0, 0, 0.01))
-        squeeze(bench, worn)
-        worn.run("return new Promise((done) => setTimeout(done, 250))")
-        assert abs(bench.tcp - before).max() < 1e-4, "neither does another squeeze, with the hand elsewhere"
-        turned = bench.arm.state(max_age=2.0).tcp
-        worn.run("hand.quaternion.set(0, Math.sin(0.15), 0, Math.cos(0.15))")
-        wait_for(lambda: abs(bench.arm.state(max_age=2.0).tcp.distance(turned)[1] - 0.3) < 0.02, "a turn", BRIEF)
-        worn.run("hand.updateButtonValue('trigger', 1)")
-        wait_for(lambda: bench.arm.gripper.state(max_age=2.0).width < 0.01, "the fingers to close", BRIEF)
-
-    worn.size(390, 844, touch=True)
-    wait_for(lambda: worn.text("#headset"), "the button")
-    assert worn.run("return document.documentElement.scrollWidth") <= 390, "it fits on a phone"
-    worn.size(1280, 800)
-    wear(worn)
-    bench.arm.gripper.open()
-    undisturbed(bench, worn, drive)
-    worn.run("hand.updateButtonValue('a-button', 1)")
-    wait_for(lambda: bench.trip == "stop", "STOP by the controller")
-
-
-def glide(page: Browser, step: tuple[float, float, float]) -> None:
-    """Move the hand by ten steps, m, one with each picture."""
-    page.run("speed = [0, 0, 0];" + GLIDE, [0, 0, 0], list(step))
-
-
+HUNG = ("the headset hangs", "the controller does not answer", "the tracking leapt")
+"""What the page says when it shows a picture later than every 0.12 s: it lets go then, and a person squeezes anew."""
 GLIDE = """const steps = { left: arguments[0], right: arguments[1] };
     return new Promise((done) => {
       let rest = 10;
@@ -178,6 +152,117 @@ GLIDE = """const steps = { left: arguments[0], right: arguments[1] };
       next();
     })"""
 LATER = "return new Promise((done) => setTimeout(done, arguments[0]))"
+
+
+def test_two_hands_drive_two_arms(two: Bench, browser: Browser, iwer: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Each with a dead-man, a clutch and a gripper of its own.
+
+    This test comes first: the module's own rig, which would run beside it, is not open yet.
+    """
+    assert [record.name for record in caplog.get_records("setup")].count("hal.console") == 1, "the link, once"
+    arms = {arm.robot.name: arm for arm in two.session.arms}
+
+    def tcps() -> np.ndarray:
+        return np.array([arm.robot.state(max_age=2.0).tcp.position for arm in arms.values()])
+
+    def move(left: tuple[float, float, float], right: tuple[float, float, float], *ways: tuple[float, ...]) -> None:
+        """Move both hands by ten steps, and wait until the arms went these ways."""
+        to = tcps() + ways
+        browser.run(GLIDE, list(left), list(right))
+        wait_for(lambda: abs(tcps() - to).max() < 2e-3, f"the ways {ways}", BRIEF)
+
+    def hold() -> np.ndarray:
+        """Rest, then squeeze with both hands; return where the arms are."""
+        browser.run("rest()")
+        pads = [arm.pad for arm in arms.values()]
+        wait_for(lambda: all(pad.state().connected and not pad.waiting_for for pad in pads), "the pads", BRIEF)
+        wait_for(lambda: not two.session.held, "both hands to be released", BRIEF)
+        browser.run(LATER, 400)
+        start = tcps()
+        for side, arm in arms.items():
+            squeeze_anew(browser, side, lambda deadman=arm.deadman: deadman.held)
+        return start
+
+    def move_both() -> None:
+        start = hold()
+        browser.run(LATER, 250)
+        assert abs(tcps() - start).max() < 1e-4, "a squeeze moves nothing"
+        move((0, 0, -0.01), (0, 0.01, 0), (0.1, 0, 0), (0, 0, 0.1))
+
+    def release_one() -> None:
+        hold()
+        browser.run("hands.left.updateButtonValue('squeeze', 0)")
+        wait_for(lambda: not arms["left"].deadman.held, "the left hand to let go", BRIEF)
+        assert arms["right"].deadman.held, "the other hand holds on"
+        move((-0.02, 0.01, 0), (0, 0, -0.01), (0, 0, 0), (0.1, 0, 0))
+        browser.run(LATER, 250)
+        squeeze_anew(browser, "left", lambda: arms["left"].deadman.held)
+        move((-0.01, 0, 0), (0, 0, 0), (0, 0.1, 0), (0, 0, 0))
+
+    def grip() -> None:
+        hold()
+        browser.run("hands.left.updateButtonValue('trigger', 1)")
+        wait_for(lambda: arms["left"].robot.gripper.state(max_age=2.0).width < 0.01, "the left fingers to close", BRIEF)
+        assert arms["right"].robot.gripper.state(max_age=2.0).width > 0.07
+
+    def lose() -> None:
+        hold()
+        browser.run("hands.right.connected = false")
+        wait_for(lambda: not arms["right"].deadman.held, "the lost hand to let go", BRIEF)
+        move((0, -0.01, 0), (0, 0, -0.01), (0, 0, -0.1), (0, 0, 0))
+        browser.run("device.updateVisibilityState('visible-blurred')")
+        wait_for(lambda: not two.session.held, "both to let go", BRIEF)
+
+    with emulated(two, browser, iwer):
+        browser.size(640, 480)  # less to draw
+        wear(browser)
+        for attempt in (move_both, release_one, grip, lose):
+            undisturbed(two, browser, attempt, HUNG)
+        browser.chrome.get("about:blank")
+
+
+def test_the_arm_follows_the_hand_while_it_is_squeezed_and_never_jumps(bench: Bench, worn: Browser) -> None:
+    def follow(step: tuple[float, float, float], way: tuple[float, float, float]) -> None:
+        rest(bench, worn)
+        squeeze(bench, worn)
+        to = bench.tcp + way
+        glide(worn, step)
+        wait_for(lambda: abs(bench.tcp - to).max() < 2e-3, f"the way {way}", BRIEF)
+
+    def squeeze_elsewhere() -> None:
+        rest(bench, worn)
+        before = bench.tcp.copy()
+        glide(worn, (0, 0, 0.01))
+        squeeze(bench, worn)
+        worn.run(LATER, 250)
+        assert abs(bench.tcp - before).max() < 1e-4, "a squeeze moves nothing, wherever the hand is"
+
+    def turn_and_grip() -> None:
+        rest(bench, worn)
+        squeeze(bench, worn)
+        turned = bench.arm.state(max_age=2.0).tcp
+        worn.run("hand.quaternion.set(0, Math.sin(0.15), 0, Math.cos(0.15))")
+        wait_for(lambda: abs(bench.arm.state(max_age=2.0).tcp.distance(turned)[1] - 0.3) < 0.02, "a turn", BRIEF)
+        worn.run("hand.updateButtonValue('trigger', 1)")
+        wait_for(lambda: bench.arm.gripper.state(max_age=2.0).width < 0.01, "the fingers to close", BRIEF)
+
+    worn.size(390, 844, touch=True)
+    wait_for(lambda: worn.text("#headset"), "the button")
+    assert worn.run("return document.documentElement.scrollWidth") <= 390, "it fits on a phone"
+    worn.size(640, 480)  # less to draw
+    wear(worn)
+    bench.arm.gripper.open()
+    ways = (((0, 0, -0.01), (0.1, 0, 0)), ((-0.01, 0, 0), (0, 0.1, 0)), ((0, 0.01, 0), (0, 0, 0.1)))
+    follows = [partial(follow, step, way) for step, way in ways]
+    for attempt in (*follows, squeeze_elsewhere, turn_and_grip):
+        undisturbed(bench, worn, attempt, HUNG)
+    worn.run("hand.updateButtonValue('a-button', 1)")
+    wait_for(lambda: bench.trip == "stop", "STOP by the controller")
+
+
+def glide(page: Browser, step: tuple[float, float, float]) -> None:
+    """Move the hand by ten steps, m, one with each picture."""
+    page.run("speed = [0, 0, 0];" + GLIDE, [0, 0, 0], list(step))
 
 
 LOSSES = {
@@ -213,56 +298,3 @@ def test_every_loss_of_the_hand_lets_go(bench: Bench, worn: Browser) -> None:
 
     for what, (happens, ends) in LOSSES.items():
         undisturbed(bench, worn, partial(lose, what, happens, ends))
-
-
-def test_two_hands_drive_two_arms(two: Bench, browser: Browser, iwer: str, caplog: pytest.LogCaptureFixture) -> None:
-    """Each with a dead-man, a clutch and a gripper of its own."""
-    assert [record.name for record in caplog.get_records("setup")].count("hal.console") == 1, "the link, once"
-    arms = {arm.robot.name: arm for arm in two.session.arms}
-
-    def tcps() -> np.ndarray:
-        return np.array([arm.robot.state(max_age=2.0).tcp.position for arm in arms.values()])
-
-    def press(side: str, button: str, value: float) -> None:
-        browser.run(f"hands.{side}.updateButtonValue({button!r}, {value})")
-        if button == "squeeze":
-            wait_for(lambda: arms[side].deadman.held == bool(value), f"the {side} squeeze {value}", BRIEF)
-
-    def move(left: tuple[float, float, float], right: tuple[float, float, float], *ways: tuple[float, ...]) -> None:
-        """Move both hands by ten steps, and wait until the arms went these ways."""
-        to = tcps() + ways
-        browser.run(GLIDE, list(left), list(right))
-        wait_for(lambda: abs(tcps() - to).max() < 2e-3, f"the ways {ways}", BRIEF)
-
-    def drive() -> None:
-        browser.run("rest()")
-        pads = [arm.pad for arm in arms.values()]
-        wait_for(lambda: all(pad.state().connected and not pad.waiting_for for pad in pads), "the pads", BRIEF)
-        wait_for(lambda: not two.session.held, "both hands to be released", BRIEF)
-        browser.run(LATER, 400)
-        start = tcps()
-        press("left", "squeeze", 1)
-        press("right", "squeeze", 1)
-        browser.run(LATER, 250)
-        assert abs(tcps() - start).max() < 1e-4, "a squeeze moves nothing"
-        move((0, 0, -0.01), (0, 0.01, 0), (0.1, 0, 0), (0, 0, 0.1))
-        press("left", "squeeze", 0)
-        assert arms["right"].deadman.held, "the other hand holds on"
-        move((-0.02, 0.01, 0), (0, 0, -0.01), (0, 0, 0), (0.1, 0, 0))
-        browser.run(LATER, 250)
-        press("left", "squeeze", 1)
-        move((-0.01, 0, 0), (0, 0, 0), (0, 0.1, 0), (0, 0, 0))
-        press("left", "trigger", 1)
-        wait_for(lambda: arms["left"].robot.gripper.state(max_age=2.0).width < 0.01, "the left fingers to close", BRIEF)
-        assert arms["right"].robot.gripper.state(max_age=2.0).width > 0.07
-        browser.run("hands.right.connected = false")
-        wait_for(lambda: not arms["right"].deadman.held, "the lost hand to let go", BRIEF)
-        move((0, -0.01, 0), (0, 0, -0.01), (0, 0, -0.1), (0, 0, 0))
-        browser.run("device.updateVisibilityState('visible-blurred')")
-        wait_for(lambda: not two.session.held, "both to let go", BRIEF)
-
-    with emulated(two, browser, iwer):
-        browser.size(640, 480)  # less to draw
-        wear(browser)
-        undisturbed(two, browser, drive)
-        browser.chrome.get("about:blank")
