@@ -23,6 +23,7 @@ from hal import (
     Trip,
     Twist,
 )
+from hal.deadman import Deadman
 from hal.drivers.mock.faults import FIELDS
 from hal.drivers.mock.robot import MockRobot
 from hal.servo.audit import SetpointAudit
@@ -123,6 +124,21 @@ def test_a_grip_that_was_sent_before_the_press_moves_nothing_after_it(rig: hal.R
         assert not control.send(None, grip=1.0).reasons
         rig.clock.sleep(0.3)
     assert arm.gripper.state().width < 0.9 * arm.gripper.width_max
+
+
+def test_the_dead_man_of_an_earlier_session_does_not_guard_the_next_one(rig: hal.Rig, arm: hal.Robot) -> None:
+    first, second = Deadman("first"), Deadman("second")
+    for switch in (first, second):
+        switch.update(False, True, rig.clock.now())
+    for guard, moves in ((first, True), (second, False)):
+        with arm.control(deadman=guard) as control:
+            first.update(False, True, rig.clock.now())
+            rig.clock.sleep(0.02)
+            first.update(True, True, rig.clock.now())
+            rig.clock.sleep(0.02)
+            control.send(TURN)
+            rig.clock.sleep(0.02)
+            assert (arm.state().status is RobotStatus.FOLLOWING) is moves
 
 
 def test_the_first_target_of_a_chunk_is_the_one_that_is_due(rig: hal.Rig, arm: hal.Robot) -> None:
