@@ -233,7 +233,9 @@ def _choose(settings: V4l2Settings, name: str) -> FoundCamera:
     keys = {"name": settings.name, "serial": settings.serial, "port": settings.port, "device": settings.device}
     wanted = ", ".join(f"{key} {value!r}" for key, value in keys.items() if value is not None) or "any"
     if not found:
-        raise DeviceNotFound(f"camera {name}: no camera with {wanted} is connected; connected:\n{listed}")
+        raise DeviceNotFound(
+            f"camera {name}: no camera with {wanted} is connected: plug it in, or select one of these:\n{listed}"
+        )
     raise DeviceNotFound(
         f"camera {name}: {len(found)} cameras match ({wanted}); select one by serial, or alike ones by port:\n{listed}",
         code="several_devices",

@@ -20,7 +20,7 @@ from ..geometry import Pose
 from ..kinematics.collisions import in_one_place
 from ..kinematics.urdf import read_urdf
 from ..pads.model import pad_model
-from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RandomizeSpec, RobotSpec, WorldSpec
+from ..specs import BodySpec, BoxSpec, CameraSpec, CollisionSpec, PadSpec, Plan, RandomizeSpec, RobotSpec, WorldSpec
 from .context import Context, ServedConfig
 from .data_files import user_path
 from .files import find_file, read_yaml, suggest
@@ -52,6 +52,8 @@ def resolve(context: Context) -> Plan:
         _check_clock(context)
     _check_rates(context, robots)
     _check_places(context, robots)
+    for section, devices, option in (("robots", robots, "host"), ("cameras", cameras, "serial")):
+        _check_addresses(context, section, devices, option)
     driver: str | None = None
     with suppress(Unknown):
         driver = _world_driver(context)
@@ -252,6 +254,19 @@ def _check_names(context: Context) -> None:
                 message = f"{taken[name]} has the same name; names of devices must be unique"
                 context.report(key, message, "duplicate_name")
             taken.setdefault(name, key)
+
+
+def _check_addresses(context: Context, section: str, devices: Iterable[RobotSpec | CameraSpec], option: str) -> None:
+    """Report a device with the address or serial number of another one: two programs of one arm, or of one camera."""
+    taken: dict[tuple[str, str], str] = {}
+    for device in devices:
+        address = device.options.get(option)
+        if address is None or device.options.keys() & {"emulated", "play", "port", "device"}:
+            continue
+        other = taken.setdefault((device.driver, address), device.name)
+        if other != device.name:
+            message = f"{section}.{other} has the same: name the one of this device"
+            context.report(f"{section}.{device.name}.real.{option}", message, "duplicate_address")
 
 
 def _check_clock(context: Context) -> None:

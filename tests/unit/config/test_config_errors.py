@@ -25,6 +25,8 @@ from hal.errors import ConfigError, Problem
 ROBOT = {"model": "panda"}
 LOOK = {"target": [0, 0, 0], "distance": 1.0}
 CAMERA = {"model": "realsense_d435", "look_at": LOOK}
+SERIAL = CAMERA | {"real": {"serial": "012345678901"}}
+UR = {"model": "ur5e", "real": {"host": "192.0.2.1"}, "gripper": {"enabled": False}}
 
 
 def problems(config: Any, **arguments: Any) -> list[Problem]:
@@ -167,8 +169,10 @@ def thing(**keys: Any) -> dict[str, Any]:
         (leader(options={"ids": [1, 2]}), "leaders.l.options.ids", "wrong_count"),
         (leader(engage="approach"), "leaders.l.engage", "conflict"),
         (leader(driver="ur"), "leaders.l.driver", "wrong_driver"),
-        # Names of devices.
+        # Names and addresses of devices.
         ({"robots": {"a": ROBOT}, "cameras": {"a": CAMERA}}, "cameras.a", "duplicate_name"),
+        ({"sim": False, "cameras": dict.fromkeys("ab", SERIAL)}, "cameras.b.real.serial", "duplicate_address"),
+        ({"sim": False, "robots": dict.fromkeys("ab", UR)}, "robots.b.real.host", "duplicate_address"),
     ],
 )
 def test_one_mistake_is_one_problem_with_its_key(config: dict[str, Any], key: str, code: str) -> None:

@@ -143,6 +143,7 @@ def test_alike_cameras_are_told_apart_by_serial_or_port(tmp_path: Path) -> None:
                 driver(**changes).open()
             assert 'serial "A1", port 1-1, /dev/video0' in str(caught.value)
             assert (caught.value.code == "several_devices") == (changes in ({"name": "HD"}, {}))
+            assert "select one" in str(caught.value), "the remedy"
         cameras[1].refused = errno.EACCES
         with pytest.raises(DeviceNotFound, match="usermod -aG video"):
             driver(device="/dev/video1").open()
