@@ -117,6 +117,7 @@ class Control:
         self._detach: Callable[[], None] | None = None
         self._grip = (0.0, 0.0, 0)
         """Width, m, force, N, and number of the newest command to the gripper; 0 before the first one."""
+        self._paused = False  # whether no grip was asked for since: then one that failed is sent again
         self._refused = 0
         self._t_sent = -math.inf
         self._at_once = 0
@@ -353,6 +354,7 @@ class Control:
         target = self._finger_target(grip, width, force)
         if command is not None:
             command = self._send_command(command, servo, now, t_event, waiting, reasons)
+        self._paused |= target is None
         if target is not None:
             with self._lock:
                 self._send_fingers(target, waiting, reasons)
@@ -498,14 +500,17 @@ class Control:
     def _send_fingers(self, target: tuple[float, float], waiting: bool, reasons: list[str]) -> None:
         gripper = self.robot.gripper
         assert gripper is not None
-        if gripper.trouble:
-            reasons.append(gripper.trouble)
+        trouble = gripper.trouble
+        if trouble:
+            reasons.append(trouble)
         if waiting:
             reasons.append("the dead-man is not held: the gripper does not move")
             return
         before, pressed, number = self._grip
         small = abs(target[0] - before) <= gripper.spec.width_max * 0.005 and target[1] == pressed
-        if not (number and small) or gripper._is_over(number):
+        repeats = self._paused and bool(trouble)
+        self._paused = False
+        if not (number and small) or repeats or gripper._is_over(number):
             self._grip = (*target, gripper._send(self._id, *target))
 
 

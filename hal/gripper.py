@@ -122,11 +122,13 @@ class Gripper:
 
         Never waits or raises; for control loops that continue without a gripper.
         """
+        found = self._mail.get()
+        failed = found is not None and found.state.outcome is GripperOutcome.FAILED
+        lost = failed and found is not None and found.lost  # its fault is then the loss
         try:
-            state = self.state()
+            state = self.state(-1.0 if lost else 0.5)
         except (ConnectionLost, StaleStateError) as error:
             return str(error)
-        failed = state.outcome is GripperOutcome.FAILED
         return f"the gripper of {self._robot} failed: {state.fault}" if failed else ""
 
     def width_of(self, fraction: float) -> float:

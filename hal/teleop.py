@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .gamepad import Gamepad
     from .gripper import Gripper
     from .robot import Robot
-    from .types import RobotState
+    from .types import GripperState, RobotState
     from .views import Viewer3D
 
 _CROSSED = 0.05
@@ -177,8 +177,8 @@ class Teleop:
             return 0.0 if pad.pressed(str(mapping.open)) else None
         wanted = min(1.0, max(0.0, pad.axis(mapping.axis)))
         if not self._has_grip:
-            state = gripper.peek()
-            if state is None or gripper.trouble:
+            state = _find_state(gripper)
+            if state is None:
                 return None  # the width is unknown
             difference = wanted - gripper.grip_at(state.width)
             crossed = self._side * difference < 0.0
@@ -189,8 +189,8 @@ class Teleop:
     def _toggle(self, pressed: bool, gripper: Gripper) -> float | None:
         """Return the grip of a press, for as long as it lasts, so that no single command matters."""
         if pressed and not self._was_toggle:
-            state = gripper.peek()
-            if state is not None and not gripper.trouble:
+            state = _find_state(gripper)
+            if state is not None:
                 closed = state.grasped is True or gripper.grip_at(state.width_target) > _HALF
                 self._toggled = 0.0 if closed else 1.0
         elif not pressed:
@@ -336,6 +336,19 @@ STILL = Twist((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 """The command to stay."""
 
 
+def _find_state(gripper: Gripper) -> GripperState | None:
+    """Return the gripper's state, also after a command failed; None while it does not answer."""
+    try:
+        return gripper.state()
+    except (ConnectionLost, StaleStateError):
+        return None
+
+
+def _kind_of(trouble: str) -> str:
+    """Return a trouble of a gripper without what changes while it lasts: the age of its last state, and the reason."""
+    return trouble if " failed: " in trouble else trouble.partition(" for ")[0]
+
+
 class ArmTeleop:
     """One of the arms that a :class:`hal.TeleopSession` drives at once: its pad, mapping, dead-man, state and stops.
 
@@ -466,7 +479,7 @@ class ArmTeleop:
             self.state = None
             return
         trouble = self.robot.gripper.trouble if self.robot.gripper is not None else ""
-        if trouble and not self.gripper_trouble:
+        if trouble and _kind_of(trouble) != _kind_of(self.gripper_trouble):
             self.announce(f"GRIPPER: {trouble}", "gripper_fault", trouble)
         elif self.gripper_trouble and not trouble:
             self.announce("the gripper answers again", "gripper_recovered")

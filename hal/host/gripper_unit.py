@@ -136,7 +136,8 @@ class GripperUnit:
             self.driver.stop()
         except Exception as error:
             self._unheard = math.inf
-            self._fail(error)
+            if self._outcome is not GripperOutcome.FAILED:  # otherwise why it failed remains
+                self._fail(error)
         else:
             if self._lost:
                 self._unheard = math.inf

@@ -247,6 +247,46 @@ def test_settings_of_a_page_wait_for_the_release_of_the_dead_man() -> None:
         assert rig.robots["panda"].state().tcp.position[2] == z["panda"]
 
 
+@pytest.mark.parametrize("gripper", [{"axis": "r2"}, {"toggle": "r1"}, {"open": "east", "close": "south"}])
+def test_each_trouble_of_a_gripper_is_announced_and_a_press_after_it_moves_the_fingers(
+    bench: Bench, gripper: dict[str, str]
+) -> None:
+    fingers, pull = bench.arm.gripper, gripper.get("close") or gripper.get("toggle")
+    assert fingers is not None
+
+    def close() -> None:
+        bench.hand.press(pull) if pull else bench.hand.stick("r2", 1.0)
+
+    def let_go() -> None:
+        bench.hand.release("l2", *filter(None, [pull]))
+        bench.hand.stick("r2", 0.0)
+
+    def fault(**faults: object) -> Callable[[], object]:
+        return lambda: fingers.inject(**faults)
+
+    bench.open_session(mapping={"deadman": "l2", "gripper": gripper})
+    bench.run(
+        9.0,
+        (0.2, fault(fail="too hot")),
+        (0.5, bench.press("l2")),
+        (0.8, close),
+        (1.2, let_go),
+        (1.5, fault(fail=None, disconnect=True)),
+        (3.0, fault(disconnect=False)),
+        (4.0, fault(disconnect=True)),
+        (5.5, fault(disconnect=False)),
+        (6.0, bench.press("l2")),
+        (6.5, close),
+        (8.5, let_go),
+    )
+    told = [event.text for event in bench.events if event.kind == "gripper_fault"]
+    assert [("too hot" in text, "disconnect" in text) for text in told] == [(True, False), (False, True)] * 2 + [
+        (True, False)
+    ]
+    assert bench.kinds.count("gripper_recovered") == 1
+    assert fingers.state().width < 0.01
+
+
 def test_a_reset_drives_home_only_for_a_press_made_for_it(bench: Bench) -> None:
     assert bench.session.drives_home
     bench.arm.move_to(bench.arm.home + 0.1)

@@ -452,6 +452,16 @@ def test_what_was_grasped_while_the_connection_was_lost_gets_no_stop(bench, agai
     assert (bench.fingers.is_grasped, bench.fingers.width) == (True, 0.03)
 
 
+def test_a_soft_object_that_yields_to_the_fingers_gets_no_stop_either(bench):
+    bench.controller.move(0.0, 0.05, 40.0)
+    bench.pass_time(0.1)
+    bench.controller.stop()
+    bench.controller.connection_lost("the cable was pulled")
+    for k in range(10):
+        bench.controller.update(HandState(9.0 + k / 50, 9.0 + k / 50, 0.03 - 1e-4 * k, 0.08, True, 30))
+        assert bench.controller.next_action(9.0 + k / 50) is None
+
+
 @pytest.mark.parametrize("seed", range(100))
 def test_random_commands_come_to_an_end(seed):
     """The bench looks: one motion at a time, no stop without a motion or for what is held, no second grasp.
