@@ -87,6 +87,10 @@ ELSEWHERE = {
         f"{WIRE}robotiq.py::test_a_line_that_is_gone_is_known_soon_and_comes_back",
     ),
     "a Robotiq gripper was without power": ("tests/unit/drivers/robotiq/test_robotiq.py::test_only_home_activates",),
+    "a stop, or a released dead-man, while a gripper does not answer": (
+        f"{WIRE}franka_hand.py::test_fingers_hear_a_stop_that_came_while_the_connection_was_lost",
+        f"{WIRE}xarm_rig.py::test_a_gripper_hears_a_stop_that_came_while_it_did_not_answer",
+    ),
     "the process of a gripper dies": (
         f"{SYSTEM}gripper_process.py::test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead",
     ),
