@@ -60,6 +60,7 @@ class MirroredArm:
         gripper = spec.gripper
         self._client = client
         self._body = body
+        self._dt = dt
         self._joints = [body.joints[name] for name in spec.joints]
         self._torques = [STRENGTH * body.efforts[joint] for joint in self._joints]
         self._fingers = [body.joints[name] for name in gripper.joints] if gripper else []
@@ -69,6 +70,8 @@ class MirroredArm:
         self._fresh = False
         """Whether a state of the arm has arrived since the last step."""
         self._following = False
+        self._ahead: tuple[list[float], list[float]] = ([], [])
+        """Where the arm is after the step, rad, and its speeds, rad/s."""
         self._placed = False
         """Whether its fingers have been placed at the arm's width once."""
         self._hold()
@@ -76,12 +79,16 @@ class MirroredArm:
     def follow(self, positions: list[float], speeds: list[float], width: float | None) -> None:
         if width is not None and self._fingers:
             self._follow_width(width)
+        self._place(positions, speeds)
         client = self._client
-        client.resetJointStatesMultiDof(self._body.id, self._joints, _singly(positions), _singly(speeds))
         client.setJointMotorControlArray(
             self._body.id, self._joints, client.VELOCITY_CONTROL, targetVelocities=speeds, forces=self._torques
         )
+        self._ahead = [q + dq * self._dt for q, dq in zip(positions, speeds, strict=True)], speeds
         self._fresh = self._following = True
+
+    def _place(self, positions: list[float], speeds: list[float]) -> None:
+        self._client.resetJointStatesMultiDof(self._body.id, self._joints, _singly(positions), _singly(speeds))
 
     def _follow_width(self, width: float) -> None:
         assert self._gripper is not None
@@ -106,6 +113,11 @@ class MirroredArm:
             self._hold()
             self._following = False
         self._fresh = False
+
+    def finish_step(self) -> None:
+        """Place the mirror where the arm is after the step: what it pushed does not stop a real arm."""
+        if self._following:
+            self._place(*self._ahead)
 
     def _hold(self) -> None:
         client = self._client

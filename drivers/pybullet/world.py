@@ -53,10 +53,9 @@ SOLUTION: dict[str, dict[str, Any]] = {
 1.7 mm/s), and after so many iterations at the latest.
 
 "fine" is needed while fingers move slowly or hold something: with 100 iterations the six joints of a Robotiq 2F-85
-press with 52 N of 60. It is used with the mirror of a real arm, too, which nothing stops: one that pushes 50 kg is off
-by up to 2 mrad. With twice the iterations it is not, but then a slow computer falls behind an arm that holds something:
-a step takes up to 6 ms of 4. With "coarse" a step takes less time, and an arm follows less exactly; with PyBullet's own
-50 iterations fast arms exceed their speed limits a little."""
+press with 52 N of 60. With more iterations a slow computer falls behind an arm that holds something: with 400 a step
+takes up to 6 ms of 4. With "coarse" a step takes less time, and an arm follows less exactly; with PyBullet's own 50
+iterations fast arms exceed their speed limits a little."""
 
 
 LEAST_HZ = 100.0
@@ -122,6 +121,8 @@ class PyBulletWorld(SimulatedWorld[Body]):
                 self.push_link(force)
             self.spend_forces()
         self._step()
+        for arm in self._mirrored.values():
+            arm.finish_step()
         self._attached.follow()
         self.steps += 1
 
@@ -167,9 +168,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
     # --- the engine of SimulatedWorld --------------------------------------------------------------------------------
 
     def _set_solution(self) -> None:
-        mirrors = any(robot.driver != self.spec.driver for robot in self.spec.robots)
-        kind = "fine" if mirrors or self._handling else "coarse"
-        self.client.setPhysicsEngineParameter(**SOLUTION[kind])
+        self.client.setPhysicsEngineParameter(**SOLUTION["fine" if self._handling else "coarse"])
 
     def load_body(self, spec: BodySpec | RobotSpec) -> Body:
         load = load_robot if isinstance(spec, RobotSpec) else load_object

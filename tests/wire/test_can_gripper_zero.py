@@ -19,6 +19,8 @@ from hal.apps import _gripper_zero
 from hal.apps._common import ACTION_NEEDED
 from hal.apps.calibrate import main
 
+pytestmark = pytest.mark.pair
+
 OFFSET = 0.8
 """Error of the rig's offset, rad: where it takes the fingers for closed they are not."""
 GEAR = 0.095 / 6.5
@@ -36,8 +38,7 @@ class Bench:
     def run(self, held: tuple[float, float] | None, then: str = "") -> Done:
         """Run the program with a pad whose dead-man is held; execute ``then`` when the fingers move."""
         motor = f"{{id: 7, type: DM4310, kp: 20, kd: 0.5, offset: {OFFSET}}}"
-        slow = "robots.arm.rate_hz=100"  # for a busy computer
-        overrides = [*self.emulator.overrides, f"robots.arm.gripper.real.motor={motor}", slow]
+        overrides = [*self.emulator.overrides, f"robots.arm.gripper.real.motor={motor}"]
         options = [word for value in overrides for word in ("--set", value)]
         pad = write_pad(self.folder, until=60.0, held=held)
         ended = threading.Event()

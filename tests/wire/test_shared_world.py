@@ -181,7 +181,7 @@ class Person:
                 if not last:
                     self._put_down()
                 self.pad.release("l2")
-                self._tap("home", " s, success")
+                self._tap("home", ", success;")
         except BaseException as failure:  # of the test, which fails with it
             self.failure = failure
             if not self.over:

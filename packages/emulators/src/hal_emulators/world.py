@@ -22,9 +22,8 @@ import traceback
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import mul
 from typing import Any
-
-import numpy as np
 
 from hal import registry
 from hal.config.loader import load
@@ -46,8 +45,10 @@ _FINGER_SPEED = 3.0
 """The world's fingers may be so many times as fast as the emulated ones, so that they can follow."""
 _TOUCHED = 0.02
 """Time after the last contact until which it counts, s: contacts flicker."""
-_AT_ONCE = frozenset({"pose", "poses"})
-"""Requests that loops and recordings make at their rate: they get the state of the newest step, however late."""
+_SHOWN = 4
+"""A late world shows every so many steps only: it has to catch up."""
+_AT_ONCE = frozenset({"pose", "poses", "contacts"})
+"""Requests that loops, recordings and views make at their rate: they get the newest step, however late."""
 _OPPOSITE = -0.5
 """Greatest cosine between the two sides' normals of contact with an object between them."""
 
@@ -155,10 +156,14 @@ class ArmOfWorld:
                 if contact["link_a"] in links and contact["b"] != self.name:
                     side.setdefault(contact["b"], []).append(contact["normal"])
         return any(
-            float(np.mean(one[thing], axis=0) @ np.mean(other[thing], axis=0)) < _OPPOSITE
+            sum(map(mul, _mean(one[thing]), _mean(other[thing]))) < _OPPOSITE
             for one, other in itertools.combinations(touched, 2)
             for thing in one.keys() & other
         )
+
+
+def _mean(normals: Sequence[Sequence[float]]) -> list[float]:
+    return [sum(axis) / len(normals) for axis in zip(*normals, strict=True)]
 
 
 def _find_sides(body: Any, joints: Sequence[str]) -> list[set[str]]:
@@ -221,6 +226,8 @@ class WorldServer:
             if self._t + dt <= reported:
                 self._t += dt
                 self._step(self._t, dt)
+                if self._t + dt > reported or self.world.steps % _SHOWN == 0:
+                    self._show()
             self._answer_due(self._t + dt)
             ready = self._t + dt <= reported
             for descriptor, _ in self._poller.poll(0.0 if ready else dt):
@@ -250,6 +257,9 @@ class WorldServer:
             arm.finish_step(t)
         for descriptor, arm in (*self._arms_of.items(), *self._fingers_of.items()):
             self._send(descriptor, {"object": arm.object_width, "t": t})
+
+    def _show(self) -> None:
+        """Send the state to all who watch."""
         watching = [descriptor for descriptor, role in self._roles.items() if role == "poses"]
         if watching:
             state = self._state()

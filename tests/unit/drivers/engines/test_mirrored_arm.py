@@ -90,7 +90,7 @@ def test_pushes_objects_and_is_not_stopped_by_them(engine: Engine) -> None:
         world.follow("arm", q, [0.5, *REST[1:]], 0.04)
         world.step()
     assert joints(world)[0] == pytest.approx(run_into, abs=2e-3)
-    assert joints(world)[1:] == pytest.approx(q[1:], abs=2e-3)
+    assert joints(world)[1:] == pytest.approx(q[1:], abs=1e-3)
     assert world.pose("block")["position"][1] > 0.40
     world.close()
 
