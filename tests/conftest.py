@@ -34,6 +34,7 @@ TESTS = Path(__file__).resolve().parent
 os.environ["PYTHONPATH"] = os.pathsep.join(
     [str(TESTS.parent / "packages/emulators/src"), *filter(None, [os.environ.get("PYTHONPATH")])]
 )
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of a thousand programs would compile everything again
 
 FAST = {
     "unit": "one part of the package at a time",

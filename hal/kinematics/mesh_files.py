@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib.metadata
 import importlib.util
 import io
 import os
@@ -46,7 +45,9 @@ def _find_package(package: str, path: tuple[str, ...]) -> Path:
     if spec is not None and spec.origin:
         return Path(spec.origin).parent
     name = package.replace("_", "-")
-    folder = Path(str(importlib.metadata.distribution(name).locate_file(f"cmeel.prefix/share/{name}")))
+    from importlib.metadata import distribution  # slow to import, so only when it is needed
+
+    folder = Path(str(distribution(name).locate_file(f"cmeel.prefix/share/{name}")))
     if not folder.is_dir():
         raise ImportError(f"{package} has no folder")
     return folder

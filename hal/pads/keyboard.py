@@ -42,9 +42,9 @@ class KeyboardTable(NamedTuple):
 @cache
 def keyboard_table(column: str) -> KeyboardTable:
     """Return the keys that ``column`` of the table names."""
-    import yaml
+    from ..config.files import parse_yaml  # slow to import
 
-    data: dict[str, Any] = yaml.safe_load(find_data("sensors", "keyboard.yaml").read_text(encoding="utf-8"))
+    data: dict[str, Any] = parse_yaml(find_data("sensors", "keyboard.yaml").read_text(encoding="utf-8"))
     rows = [(row[column], row["control"], row["label"]) for row in data["keys"] if column in row]
     pushes = {key: (control[1:], 1.0 if control[0] == "+" else -1.0) for key, control, _ in rows if control[0] in "+-"}
     labels: dict[str, list[str]] = {}

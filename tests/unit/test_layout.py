@@ -62,7 +62,10 @@ def _imports(module: str) -> Iterator[str]:
     """Yield the dotted names that a module imports, ``module.name`` for each name, TYPE_CHECKING included."""
     path = sources()[module]
     package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
-    for node in ast.walk(tree(path)):
+    nodes: list[ast.AST] = [tree(path)]
+    for node in nodes:
+        inside = ast.iter_child_nodes(node)
+        nodes += [child for child in inside if isinstance(child, (ast.stmt, ast.excepthandler, ast.match_case))]
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
