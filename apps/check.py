@@ -349,7 +349,15 @@ def main(args: argparse.Namespace) -> int:
         found = _print_results(verdicts)
         if not list_real_arms(plan) and not list_checked_cameras(plan) and not list_leaders(plan):
             print("no device checks for this rig; checked this computer only")
+        _name_links(plan)
     return 0 if _fit(found) else ACTION_NEEDED
+
+
+def _name_links(plan: Plan) -> None:
+    """Print how to check the other computers that a rig has devices at."""
+    places = [device.at for devices in (plan.robots, plan.cameras, plan.pads) for device in devices]
+    for at in dict.fromkeys(place for place in places if place is not None):
+        print(f"for the link to {at}: hal check --at {at}; for its devices: hal check on that computer")
 
 
 def _link(at: str, duration: float, as_json: bool) -> int:

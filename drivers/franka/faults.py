@@ -132,7 +132,7 @@ KNOWN_ERRORS = (
         "manual error recovery required",
         "manual_recovery",
         "automatic recovery cannot clear this error",
-        "press the user stop and release it, or clear the error in Desk",
+        "do what the arm's fault says; if it stays, press and release the user stop, or clear the error in Desk",
     ),
     KnownError(
         "aborted by reflex",

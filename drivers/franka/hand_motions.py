@@ -17,7 +17,7 @@ when that motion has ended. Stops of this hand are known to be ignored, or to re
 stop are checked.
 
 The hand continues a motion whose client is lost. Such a stray motion is stopped on the next connection if a stop, or
-another command, came meanwhile, and only while the states show that the fingers move.
+another command, came meanwhile, and only while the states show that the fingers move, or that something blocks a move.
 """
 
 from __future__ import annotations
@@ -470,12 +470,19 @@ class HandController:
     def _watch_stray(self, stray: _RunningCall, state: HandState, now: float) -> HandAction | None:
         """Stop the stray motion if that is due; forget it when it is over, or holds an object."""
         rests = state.t - self._t_moved > _REST_TIME
+        due = self._ends_stray and stray.stopped_at is None and not _is_pressing(stray.call, state)
+        if due and (abs(self.speed) > _AT_REST or (rests and self._is_blocked(stray.call, state))):
+            self._t_moved = state.t
+            return self._send_stop(stray, state, now, HandAction.STOP_STRAY)
         awaited = self._command is not None or stray.stopped_at is not None  # otherwise it may begin late
         if _is_pressing(stray.call, state) or (rests and (awaited or now > stray.deadline)):
             self._stray = None
-        elif self._ends_stray and stray.stopped_at is None and abs(self.speed) > _AT_REST:
-            return self._send_stop(stray, state, now, HandAction.STOP_STRAY)
         return None
+
+    def _is_blocked(self, call: GripperCall, state: HandState) -> bool:
+        """Return whether fingers at rest may continue a move once what is in their way is gone."""
+        there = bool(call.arguments) and abs(state.width - call.arguments[0]) <= self.range.tolerance
+        return call.method == "move" and not there and not is_holding(state)
 
     def _send_stop(self, running: _RunningCall, state: HandState, now: float, action: HandAction) -> HandAction:
         running.stopped_at = now

@@ -218,6 +218,13 @@ def _host(value: Any) -> str:
     return text
 
 
+def _check_port(at: str) -> str:
+    port = at.rpartition(":")[2] if not at.endswith("]") else ""
+    if port.isdecimal() and not 0 < int(port) < 65536:
+        raise ValueProblem(f"a port is a number from 1 to 65535, not {port}", "out_of_range")
+    return at
+
+
 def is_own_host(options: Mapping[str, Any]) -> bool:
     """Return whether ``host`` in a device's options is this computer, so that the device can only be an emulator."""
     host = str(options.get("host", "")).strip().removesuffix(".").lower()
@@ -230,7 +237,11 @@ def is_own_host(options: Mapping[str, Any]) -> bool:
 Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(pattern=r"^_?[A-Za-z][A-Za-z0-9_-]*$")]
 Host = Annotated[str, BeforeValidator(_host)]
-Address = Annotated[str, Field(pattern=r"^([A-Za-z0-9._-]+|\[[0-9a-fA-F:.]+\])(:[0-9]{1,5})?$")]
+Address = Annotated[
+    str,
+    Field(pattern=r"^([A-Za-z0-9._-]+|\[[0-9a-fA-F:.]+\])(:[0-9]{1,5})?$"),
+    AfterValidator(_check_port),
+]
 """A computer's name or address, with or without a port."""
 Pixels = Annotated[int, Field(strict=True, gt=0, le=16384)]
 

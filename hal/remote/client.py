@@ -28,9 +28,13 @@ PERIOD = 0.001
 
 
 def split_address(at: str) -> tuple[str, int]:
-    """Return name and port of ``NAME[:PORT]``, of which IPv6 addresses are in brackets."""
+    """Return name and port of ``NAME[:PORT]``, of which IPv6 addresses are in brackets. Raises ValueError."""
     name, colon, port = at.rpartition(":") if not at.endswith("]") else (at, "", "")
-    return (name.strip("[]"), int(port)) if colon else (at.strip("[]"), PORT)
+    if not colon:
+        return at.strip("[]"), PORT
+    if not 0 < int(port) < 65536:  # the system would take the rest of a division
+        raise ValueError(f"there is no port {port}")
+    return name.strip("[]"), int(port)
 
 
 def connect(at: str, purpose: dict[str, Any]) -> tuple[RigLink, dict[str, Any]]:

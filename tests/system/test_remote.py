@@ -24,7 +24,7 @@ from recording_kit import small
 from waiting import wait_until
 
 import hal
-from hal.apps import collect, replay, rollout
+from hal.apps import check, collect, replay, rollout
 from hal.deadman import Deadman
 from hal.errors import CommandError, ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
 from hal.host import records
@@ -92,6 +92,8 @@ def roll_out(arm_at: str, folder: Path) -> None:
     try:
         devices = {"robots": {"panda": {"at": arm_at}}, "cameras": {"scene": {"at": camera_at}}}
         (folder / "rig.yaml").write_text(json.dumps(devices))
+        checked = run_here(check.main, "--config", folder / "rig.yaml", "--duration", 0.1)
+        assert f"hal check --at {arm_at};" in checked.stdout, checked.stdout + checked.stderr
         with serving(0.05, 0.04) as (_, url):
             words = ["--config", folder / "rig.yaml", "--policy", url, "--policy-config", folder / "policy.yaml"]
             words += ["--task", "left", "--seconds", 1.5, "--rate", 50, "--report", folder / "report.json"]

@@ -82,6 +82,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         ({"objects": {"cube": 1}}, "objects", "wrong_type"),
         ({"objects": [7]}, "objects.0", "wrong_type"),
         (robot(speed=1.5), "robots.arm.speed", "out_of_range"),
+        (robot(at="arm-pc:99999"), "robots.arm.at", "out_of_range"),
         (robot(speed=True), "robots.arm.speed", "wrong_type"),
         (robot(model=5), "robots.arm.model", "wrong_type"),
         ({"robots": {"arm": {}}}, "robots.arm.model", "missing_key"),

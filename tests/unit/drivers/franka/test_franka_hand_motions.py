@@ -92,7 +92,9 @@ class Bench:
                 self.stops += 1
             elif order is HandAction.STOP_STRAY:
                 assert not self._waiting
-                assert self.now - self._t_moved < 0.3 + self.delay, "a stop for fingers at rest"
+                call = self.calls[-1]
+                blocked = call.method == "move" and abs(call.arguments[0] - self.fingers.width) > 0.002
+                assert blocked or self.now - self._t_moved < 0.3 + self.delay, "a stop for fingers at rest"
                 assert not self.fingers.is_grasped, "a stop for what is held"
                 self.stray_stops += 1
             else:
@@ -460,6 +462,20 @@ def test_a_soft_object_that_yields_to_the_fingers_gets_no_stop_either(bench):
     for k in range(10):
         bench.controller.update(HandState(9.0 + k / 50, 9.0 + k / 50, 0.03 - 1e-4 * k, 0.08, True, 30))
         assert bench.controller.next_action(9.0 + k / 50) is None
+
+
+def test_fingers_that_are_blocked_get_the_stop_that_the_loss_of_the_connection_kept_from_them(bench):
+    bench.controller.move(0.08, 0.02, 40.0)
+    bench.pass_time(0.1)
+    bench.lose(0.3)
+    bench.controller.stop()
+    bench.fingers.advance = lambda dt: None  # the wall of a box is in their way
+    bench.pass_time(1.0)
+    del bench.fingers.advance
+    width = bench.fingers.width
+    bench.pass_time(5.0)
+    assert bench.stray_stops == 1
+    assert bench.fingers.width == width < 0.06
 
 
 @pytest.mark.parametrize("seed", range(100))
