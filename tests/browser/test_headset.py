@@ -9,6 +9,7 @@ import tarfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ import pytest
 from .kit import Bench, Browser, need_browser, wait_for
 from .moves import BRIEF, clear_trip, undisturbed
 from .test_settings import TWO_ARMS
+from .test_taps import LISTEN
 
 TWO_HANDS = TWO_ARMS | {
     "gamepads": {
@@ -151,6 +153,18 @@ GLIDE = """const steps = { left: arguments[0], right: arguments[1] };
       };
       next();
     })"""
+SHOWN = """
+    const next = XRSession.prototype.requestAnimationFrame;
+    window.pictures = [];
+    XRSession.prototype.requestAnimationFrame = function (call) {
+      return next.call(this, (...now) => {
+        const start = performance.now();
+        call(...now);
+        if (sent.at(-1)?.hands.any) pictures.push({ start, sent: sent.at(-1).t >= start });
+      });
+    };
+"""
+"""Notes of each picture in which the hand holds whether a message was sent in it."""
 LATER = "return new Promise((done) => setTimeout(done, arguments[0]))"
 
 
@@ -246,15 +260,27 @@ def test_the_arm_follows_the_hand_while_it_is_squeezed_and_never_jumps(bench: Be
         worn.run("hand.updateButtonValue('trigger', 1)")
         wait_for(lambda: bench.arm.gripper.state(max_age=2.0).width < 0.01, "the fingers to close", BRIEF)
 
+    def send_with_every_picture() -> None:
+        """A pose that waits for the next beat is up to 20 ms old."""
+        rest(bench, worn)
+        squeeze(bench, worn)
+        worn.run("pictures.length = 0")
+        wait_for(lambda: worn.run("return pictures.length") > 30, "pictures", BRIEF)
+        pictures = worn.run("return pictures")
+        apart = [now for last, now in pairwise(pictures) if now["start"] - last["start"] > 8.0]
+        assert apart
+        assert [now for now in apart if not now["sent"]] == []
+
     worn.size(390, 844, touch=True)
     wait_for(lambda: worn.text("#headset"), "the button")
     assert worn.run("return document.documentElement.scrollWidth") <= 390, "it fits on a phone"
     worn.size(640, 480)  # less to draw
+    worn.run(LISTEN + SHOWN)
     wear(worn)
     bench.arm.gripper.open()
     ways = (((0, 0, -0.01), (0.1, 0, 0)), ((-0.01, 0, 0), (0, 0.1, 0)), ((0, 0.01, 0), (0, 0, 0.1)))
     follows = [partial(follow, step, way) for step, way in ways]
-    for attempt in (*follows, squeeze_elsewhere, turn_and_grip):
+    for attempt in (*follows, squeeze_elsewhere, turn_and_grip, send_with_every_picture):
         undisturbed(bench, worn, attempt, HUNG)
     worn.run("hand.updateButtonValue('a-button', 1)")
     wait_for(lambda: bench.trip == "stop", "STOP by the controller")

@@ -106,6 +106,16 @@ def test_the_dead_man_and_what_moves_the_arm_are_over_at_once(page: Browser, tar
     assert [one["down"] for one in presses(page, button)[1:]].count(True) == 0
 
 
+def test_a_gripper_on_its_way_delays_no_release(page: Browser) -> None:
+    """Its keys send at every beat; what was sent just before a beat is no clogged connection."""
+    page.key("KeyG", "g", True)
+    for _ in range(8):
+        assert [one["buttons"] & 1 << BUTTONS.index("l2") != 0 for one in tap(page, "Space")] == [True, False]
+    moved = {one["axes"][PAGE_AXES.index("r2")] for one in page.run("return window.sent") if one["type"] == "pad"}
+    assert len(moved) > 4, "the gripper was on its way"
+    page.key("KeyG", "g", False)
+
+
 def test_nor_is_a_key_that_pushes_an_axis(page: Browser) -> None:
     pushed = [one["axes"][PAGE_AXES.index("dpad_y")] for one in tap(page, "ArrowUp")]
     assert pushed == [1, 0]
