@@ -20,6 +20,8 @@ import hal
 from hal.config.data_files import find_data
 from hal.skills import grasp, grasp_pose, locate_by_truth
 from hal_emulators.lab import list_emulators
+from hal_emulators.robotiq.server import RobotiqEmulator, find_grippers
+from hal_emulators.shared_world import has_world
 
 from .franka_kit import free_host
 from .ur_kit import PORTS
@@ -152,3 +154,14 @@ def test_it_names_a_model_that_has_no_emulator_and_knows_the_address_of_localhos
     model.write_bytes(find_data("robots", "ur5e.yaml").read_bytes())
     with pytest.raises(ValueError, match=r"arm: .*my_ur16e.* has no emulator, only ur10, ur10e, ur16e"):
         list_emulators("ur5e_robotiq", [f"robots.arm.model={model}"])
+
+
+def test_a_simulated_arm_has_an_emulated_gripper(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    gripper = {"model": "robotiq_2f85", "sim": False, "real": {"port": str(tmp_path / "grip.emulated")}}
+    path.write_text(yaml.safe_dump({"robots": {"arm": {"model": "panda", "gripper": gripper}}}), encoding="utf-8")
+    assert [emulator.name for emulator in list_emulators(str(path))] == ["robotiq"]
+    assert not has_world(str(path)), "the world is that of the program"
+    with RobotiqEmulator(find_grippers(path)), hal.open(path, pad="none") as rig:
+        rig.robots["arm"].gripper.home()
+        assert rig.robots["arm"].gripper.move(0.04).width == pytest.approx(0.04, abs=1e-3)

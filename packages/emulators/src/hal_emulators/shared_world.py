@@ -105,16 +105,22 @@ def raise_priority(priority: int) -> None:
 
 
 def load_real(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> Plan:
-    """Return a rig with everything real; beside leaders, arms without ``real`` are simulated. Raises ConfigError."""
+    """Return a rig with everything real; arms without ``real`` beside leaders, or with a real gripper, are simulated.
+
+    Raises ConfigError.
+    """
     rig = load(config, overrides=overrides)
-    bare = [f"robots.{name}.sim=true" for name, arm in rig.robots.items() if rig.leaders and not arm.real]
+    others = {name: rig.leaders or arm.gripper.sim is False for name, arm in rig.robots.items() if not arm.real}
+    bare = [f"robots.{name}.sim=true" for name, there in others.items() if there]
     return load(config, sim=False, overrides=[*overrides, *bare]).resolve()
 
 
 def has_world(config: str, overrides: Sequence[str] = ()) -> bool:
     """Return whether a rig has a simulated world in which all arms are emulated. Raises ConfigError."""
     world = load_real(config, overrides).world
-    return world is not None and bool(world.robots) and all(robot.emulated for robot in world.robots)
+    if world is None or not world.robots:
+        return False
+    return all(robot.emulated and robot.driver != world.driver for robot in world.robots)
 
 
 @contextlib.contextmanager
@@ -148,7 +154,7 @@ def find_address(arm: RobotSpec) -> str:
 
 def find_arm(config: str, overrides: Sequence[str], driver: str, host: str) -> RobotSpec:
     """Return the arm of a rig that has this driver and address. Raises ConfigError, and ValueError if none has."""
-    rig = load(config, sim=False, overrides=overrides).resolve()
+    rig = load_real(config, overrides)
     arm = next((arm for arm in rig.robots if arm.driver == driver and find_address(arm) == host), None)
     if arm is None:
         raise ValueError(f"{config} has no {driver} at {host}: change --host, or --set robots.NAME.real.host")

@@ -17,12 +17,11 @@ from typing import Any
 
 import can
 
-from hal.config.loader import load
 from hal.drivers.can.settings import BusSettings
 from hal.drivers.scene.shared import address_of
 from hal.specs import RobotSpec
 from hal_emulators.lines import LONGEST_GAP, Losses
-from hal_emulators.shared_world import PRIORITY, ArmInWorld, raise_priority
+from hal_emulators.shared_world import PRIORITY, ArmInWorld, load_real, raise_priority
 
 from .damiao import EmulatedDamiaoArm
 from .piper import EmulatedPiperArm
@@ -209,7 +208,7 @@ class CanEmulator:
         world that :func:`hal_emulators.shared_world.run_world` runs. Raises ConfigError, ValueError if the rig has no
         such arm, and ConnectionLost if there is no such world.
         """
-        specs = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in _ARMS]
+        specs = [spec for spec in load_real(config, overrides).robots if spec.driver in _ARMS]
         if not specs:
             raise ValueError("this rig has no arm on a CAN bus that is not simulated")
         self.arms: dict[str, EmulatedArm] = {spec.name: _ARMS[spec.driver](spec) for spec in specs}

@@ -7,9 +7,8 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from hal.config.loader import load
 from hal_emulators.control import Started, help_text, run_emulator
-from hal_emulators.shared_world import enter_world, has_world
+from hal_emulators.shared_world import enter_world, has_world, load_real
 
 from .server import COMMANDS, RobotiqEmulator, find_grippers
 
@@ -26,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Started:
     emulator = RobotiqEmulator(find_grippers(options.config, options.set), options.seed, realtime=True)
     if not options.no_world and has_world(options.config, options.set):
-        for robot in load(options.config, sim=False, overrides=options.set).resolve().robots:
+        for robot in load_real(options.config, options.set).robots:
             if robot.name in emulator.lines:
                 emulator.lines[robot.name].gripper.in_world = True
                 world = enter_world(stack, options.config, options.set, robot, role="fingers")

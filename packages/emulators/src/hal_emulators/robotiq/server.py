@@ -10,11 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hal.config.loader import load
 from hal.specs import GripperSpec
 from hal_emulators.control import Command, assign, make_commands, read_end, read_switch
 from hal_emulators.lines import LINE_COMMANDS, LONGEST_GAP, LineEmulator
-from hal_emulators.shared_world import ArmInWorld
+from hal_emulators.shared_world import ArmInWorld, load_real
 
 from .gripper import EmulatedGripper
 from .ports import Port, SerialPort, TextPort
@@ -22,7 +21,7 @@ from .ports import Port, SerialPort, TextPort
 
 def find_grippers(config: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> list[GripperSpec]:
     """Return the grippers of a rig that this emulator can play. Raises ConfigError and ValueError."""
-    robots = load(config, sim=False, overrides=overrides).resolve().robots
+    robots = load_real(config, overrides).robots
     found = [robot.gripper for robot in robots if robot.gripper is not None and robot.gripper.driver == "robotiq"]
     if not found:
         raise ValueError("this rig has no Robotiq gripper that is not simulated")
