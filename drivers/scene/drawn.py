@@ -292,8 +292,7 @@ class DrawnWorld:
         """Return the poses (N, 4, 4) in the world of the frames of links, each given as (body id, link)."""
         if self._frames is None:
             self._frames = self._compute()
-        frames: Array = self._frames[[self._first[body] + link for body, link in links]]
-        return frames
+        return self._frames[[self._first[body] + link for body, link in links]]
 
     def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
         """Return ``position`` (3,) m and ``orientation`` (4,) xyzw of a link, of the base for None.

@@ -378,8 +378,7 @@ def _nearest_to_planes(
     cost = np.einsum("vi,vij,vj->v", homogeneous, total.reshape(-1, 4, 4)[cluster], homogeneous)
     order = np.lexsort((cost, cluster))
     starts = np.flatnonzero(np.diff(cluster[order], prepend=-1))
-    chosen: NDArray[np.int64] = order[starts]
-    return chosen
+    return order[starts]
 
 
 def _first_of_each(faces: NDArray[np.int64]) -> NDArray[np.bool_]:

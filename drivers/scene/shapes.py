@@ -142,8 +142,7 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 def unit(vectors: NDArray[Any]) -> NDArray[Any]:
     """Return vectors (N, 3) at length 1; a zero vector stays zero."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    result: NDArray[Any] = vectors / np.where(lengths == 0, 1, lengths)
-    return result
+    return vectors / np.where(lengths == 0, 1, lengths)
 
 
 # --- primitive shapes ------------------------------------------------------------------------------------------------
@@ -208,8 +207,7 @@ def _revolve(profile: Array, normals: Array, segments: int = _SEGMENTS) -> Mesh:
     def around(points: Array) -> Array:
         ring = points[:, None, :1] * circle[None]
         height = np.broadcast_to(points[:, None, 1:], (*ring.shape[:2], 1))
-        rows: Array = np.concatenate([ring, height], axis=2).reshape(-1, 3)
-        return rows
+        return np.concatenate([ring, height], axis=2).reshape(-1, 3)
 
     row = segments + 1
     lower = (np.arange(len(profile) - 1)[:, None] * row + np.arange(segments)).reshape(-1)

@@ -58,8 +58,7 @@ def _stripes() -> NDArray[np.float64]:
 
 
 def _gradient() -> NDArray[np.float64]:
-    smooth: NDArray[np.float64] = 0.65 + 0.35 * np.cos(2.0 * np.pi * _grid()[0])
-    return smooth
+    return 0.65 + 0.35 * np.cos(2.0 * np.pi * _grid()[0])
 
 
 def _noise() -> NDArray[np.float64]:
@@ -76,8 +75,7 @@ def _wood() -> NDArray[np.float64]:
     row, _ = _grid()
     fibres = _smooth_noise(64, 11)[:, :1] * np.ones((1, _SIDE))
     rings = np.sin(2.0 * np.pi * (6.0 * row + 0.6 * _smooth_noise(4, 12)))
-    grain: NDArray[np.float64] = 0.72 + 0.16 * rings + 0.12 * fibres
-    return grain
+    return 0.72 + 0.16 * rings + 0.12 * fibres
 
 
 _MADE = {

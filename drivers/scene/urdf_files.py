@@ -174,5 +174,4 @@ def _cut(edges: NDArray[np.float64], axis: int, plane: float) -> NDArray[np.floa
     a, b = edges[:, 0], edges[:, 1]
     passing = (a[:, axis] - plane) * (b[:, axis] - plane) < 0.0
     a, way = a[passing], (b - a)[passing]
-    crossed: NDArray[np.float64] = a + way * ((plane - a[:, axis]) / way[:, axis])[:, None]
-    return crossed
+    return a + way * ((plane - a[:, axis]) / way[:, axis])[:, None]

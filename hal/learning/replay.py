@@ -298,8 +298,7 @@ class Deviation:
     @property
     def rms(self) -> Array:
         """Root mean square of each joint (n,), rad; zeros without samples."""
-        found: Array = np.sqrt(self._squares[:-1] / max(1, self.samples))
-        return found
+        return np.sqrt(self._squares[:-1] / max(1, self.samples))
 
     @property
     def most(self) -> Array:
@@ -519,8 +518,7 @@ class TrajectoryPlayer:
     def _clip(self, q: Array) -> Array:
         """Return ``q`` within the limits: rounding may have moved a recorded set-point out of them."""
         limits = self.robot.limits
-        found: Array = np.clip(q, limits.lower, limits.upper)
-        return found
+        return np.clip(q, limits.lower, limits.upper)
 
     def _begin(self, now: float) -> TimeScaling:
         """Return the scaling that continues from :attr:`progress`, after the time to get there slowly."""

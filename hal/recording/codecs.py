@@ -52,8 +52,7 @@ def ids_to_units(numbers: NDArray[Any], lowest: float = -1) -> Units:
     first = int(lowest)
     if numbers.size and not (numbers.min() >= first and numbers.max() <= _MOST + first):
         raise ValueError(f"a number is not in {first}..{_MOST + first}, and does not fit into 16 bits")
-    units: Units = (numbers.astype(np.int64) - first).astype("<u2")
-    return units
+    return (numbers.astype(np.int64) - first).astype("<u2")
 
 
 class DepthFile:
@@ -178,8 +177,7 @@ def _shuffle(units: Units) -> bytes:
 
 def _unshuffle(data: bytes, shape: tuple[int, int]) -> Units:
     steps = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(2, -1).T).view("<u2").reshape(shape)
-    units: Units = np.cumsum(steps, axis=1, dtype=np.uint16)
-    return units
+    return np.cumsum(steps, axis=1, dtype=np.uint16)
 
 
 def _write(file: io.RawIOBase, data: bytes) -> None:

@@ -189,8 +189,7 @@ def _about(
 def _matrix(numbers: Any) -> list[list[float]] | None:
     """Return a camera matrix (3, 3); None for one that is missing or damaged."""
     try:
-        matrix: list[list[float]] = np.array(numbers, np.float64).reshape(3, 3).tolist()
-        return matrix
+        return np.array(numbers, np.float64).reshape(3, 3).tolist()
     except (TypeError, ValueError):
         return None
 

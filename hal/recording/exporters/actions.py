@@ -75,8 +75,7 @@ class ActionForm(NamedTuple):
         Raises DatasetError if the episode lacks the commanded poses.
         """
         if self.kind == "joint_position":
-            found: NDArray[np.float32] = content.episode.columns[ACTION]
-            return found
+            return content.episode.columns[ACTION]
         parts: list[NDArray[np.float64]] = []
         for arm in content.arms:
             parts += _joint_velocity(content, arm) if self.rotation is None else self._tcp(content, arm)

@@ -127,8 +127,7 @@ class EpisodeContent:
     def of(self, arm: ArmColumns, key: str) -> NDArray[Any]:
         """Return the arm's part (rows, n) of a column, without its gripper."""
         wanted = [k for k, name in enumerate(self.episode.names(key)) if arm.owns(name)]
-        found: NDArray[Any] = self._table(key)[:, wanted]
-        return found
+        return self._table(key)[:, wanted]
 
     def _table(self, key: str) -> NDArray[Any]:
         """Return a column (rows, n), also if n is 1."""
@@ -143,8 +142,7 @@ class EpisodeContent:
         names = self.episode.names(key)
         if arm.lead + _GRIPPER not in names:
             return None
-        found: NDArray[Any] = self._table(key)[:, names.index(arm.lead + _GRIPPER)]
-        return found
+        return self._table(key)[:, names.index(arm.lead + _GRIPPER)]
 
     def later_force(self, arm: ArmColumns) -> NDArray[Any] | None:
         """Return the force (rows,) that is asked of the arm's gripper one row later, N; None if it is not recorded."""
