@@ -119,15 +119,15 @@ def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:
     Raises DatasetError.
     """
     path = layout.about(number)
-    with dataset_errors(layout.root, path, number):
+    with dataset_errors(layout, path, number):
         data = read_json(path)
         name = _Own.model_validate(data).common
     common: dict[str, Any] = {}
     if name is not None:
         file = layout.common(name)
-        with dataset_errors(layout.root, file, number):
+        with dataset_errors(layout, file, number):
             common = _read_common(file, file_version(file))
-    with dataset_errors(layout.root, path, number):
+    with dataset_errors(layout, path, number):
         own = {key: value for key, value in data.items() if key not in _COMMON}
         if name is None or len(own) < len(data):
             common = _parse_common(json.dumps(common | {key: data[key] for key in _COMMON if key in data}))

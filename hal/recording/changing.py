@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CommandError, DatasetError
+from ..errors import CommandError
 from .about import read_about
 from .codecs import column_stats, exchange_flags, stats_as_lists
 from .dataset import Dataset
@@ -33,7 +33,7 @@ from .layout import (
     sync_to_disk,
     write_json,
 )
-from .validation import dataset_errors
+from .validation import dataset_errors, wrong_file
 
 
 def mark_episodes(dataset: str | Path | Dataset, marks: Mapping[int, bool | None]) -> None:
@@ -124,7 +124,7 @@ def _change_marks(
             put(layout.data(file), _write_rows, layout, file, first, rows)
         before, after = {}, {}
         for path in sorted({layout.entry(place.entry) for place in places.values()}):
-            with dataset_errors(layout.root, path):
+            with dataset_errors(layout, path):
                 before[path] = read_table(path)
                 after[path] = _changed_entries(before[path], marks, rows)
             put(path, write_table, after[path])
@@ -153,7 +153,7 @@ def _write_rows(
     import pyarrow.parquet as pq
 
     path = layout.data(file)
-    with dataset_errors(layout.root, path), pq.ParquetFile(path, page_checksum_verification=True) as old:
+    with dataset_errors(layout, path), pq.ParquetFile(path, page_checksum_verification=True) as old:
         sizes = [old.metadata.row_group(k).num_rows for k in range(old.metadata.num_row_groups)]
         table = old.read(use_threads=False)
     owners, field = table["episode_index"].to_numpy(), table.schema.field(SUCCESS)
@@ -161,8 +161,7 @@ def _write_rows(
     for number, begin in first.items():
         end = begin + len(rows[number])
         if set(owners[begin:end].tolist()) != {number}:
-            name = str(path.relative_to(layout.root))
-            raise DatasetError("has rows of another episode", file=name, episode=number)
+            raise wrong_file(layout, path, "has rows of another episode", number)
         values[begin:end] = rows[number]
     table = table.set_column(table.schema.get_field_index(SUCCESS), field, make_column(values).cast(field.type))
     with pq.ParquetWriter(new, table.schema, write_page_checksum=True) as writer:
@@ -175,7 +174,7 @@ def _write_rows(
 
 def _changed_stats(layout: DatasetLayout, old: Mapping[Path, Any], new: Mapping[Path, Any]) -> dict[str, Any]:
     """Return ``meta/stats.json`` after marks in files of ``meta/episodes`` have changed; no other file is read."""
-    with dataset_errors(layout.root, layout.stats):
+    with dataset_errors(layout, layout.stats):
         stats: dict[str, Any] = read_json(layout.stats)
         found = {name: np.asarray(value) for name, value in stats[SUCCESS].items()}
         for path in old:

@@ -30,7 +30,7 @@ from .layout import (
     EpisodePlace,
     video_names,
 )
-from .validation import dataset_errors
+from .validation import dataset_errors, wrong_file
 
 _CLOSE = 1e-4
 """Difference of a time stamp that LeRobot tolerates, s."""
@@ -47,7 +47,7 @@ def check_dataset(dataset: Dataset, episodes: Collection[int] | None = None) -> 
     if episodes is None:
         yield from check_index(layout)
     tasks: list[str] | None = None
-    with contextlib.suppress(DatasetError), dataset_errors(layout.root, layout.tasks):  # check_index found the same
+    with contextlib.suppress(DatasetError), dataset_errors(layout, layout.tasks):  # check_index found the same
         tasks = None if is_foreign(layout) else read_tasks(layout.tasks)
     start: int | None = 0
     for episode in dataset.episodes:
@@ -136,10 +136,6 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
     yield from _check_stats(layout, start)
 
 
-def _wrong(layout: DatasetLayout, path: Path, what: str, number: int | None = None) -> DatasetError:
-    return DatasetError(what, file=str(path.relative_to(layout.root)), episode=number)
-
-
 def _check_files(layout: DatasetLayout, info: Mapping[str, Any]) -> Iterator[DatasetError]:
     """Yield episodes without a description, and files that the index does not know."""
     numbers = layout.numbers()
@@ -147,48 +143,48 @@ def _check_files(layout: DatasetLayout, info: Mapping[str, Any]) -> Iterator[Dat
     for number in range(int(info["total_episodes"])):
         about: dict[str, Any] = {}
         if number not in numbers:
-            yield _wrong(layout, layout.about(number), "is missing", number)
+            yield wrong_file(layout, layout.about(number), "is missing", number)
         with contextlib.suppress(DatasetError):  # reported with its row of the index
             about = read_about(layout, number)
         places.append((number, EpisodePlace.of(number, about)))
     for path in stray_files(layout, places, video_names(info["features"])):
-        yield _wrong(layout, path, "is not in the index")
+        yield wrong_file(layout, path, "is not in the index")
 
 
 def _check_tasks(layout: DatasetLayout, info: Mapping[str, Any]) -> tuple[list[str], list[DatasetError]]:
     """Return the tasks, and what is wrong with their file."""
     try:
-        with dataset_errors(layout.root, layout.tasks):
+        with dataset_errors(layout, layout.tasks):
             tasks = read_tasks(layout.tasks)
     except DatasetError as error:
         return [], [error]
     if len(tasks) == info.get("total_tasks"):
         return tasks, []
     what = f"has {len(tasks)} tasks, and meta/info.json lists {info.get('total_tasks')}"
-    return tasks, [_wrong(layout, layout.tasks, what)]
+    return tasks, [wrong_file(layout, layout.tasks, what)]
 
 
 def _check_totals(layout: DatasetLayout, info: Mapping[str, Any], rows: int | None) -> Iterator[DatasetError]:
     """Yield a wrong number of rows; ``rows`` is that of the episodes, None if it is unknown."""
     if rows is not None and rows != info["total_frames"]:
-        yield _wrong(layout, layout.info, f"lists {info['total_frames']} rows, and the episodes have {rows}")
+        yield wrong_file(layout, layout.info, f"lists {info['total_frames']} rows, and the episodes have {rows}")
     with contextlib.suppress(DatasetError):  # reported with the rows of its episodes
         data = layout.root / "data"
         found = sum(_count_rows(layout, path) for path in layout.finished() if path.is_relative_to(data))
         if found > info["total_frames"]:  # too few are reported with their episode
             what = f"lists {info['total_frames']} rows, and the files in data/ have {found}"
-            yield _wrong(layout, layout.info, what)
+            yield wrong_file(layout, layout.info, what)
 
 
 def _check_stats(layout: DatasetLayout, rows: int | None) -> Iterator[DatasetError]:
     """Yield where ``meta/stats.json`` is damaged, or wrong for so many rows; None if their number is unknown."""
     try:
-        with dataset_errors(layout.root, layout.stats):
+        with dataset_errors(layout, layout.stats):
             stats = json.loads(layout.stats.read_text(encoding="utf-8"), parse_constant=_no_constant)
             if rows is not None and stats[STATE]["count"] != [rows]:
-                yield _wrong(layout, layout.stats, f"counts {stats[STATE]['count']} rows, and there are {rows}")
+                yield wrong_file(layout, layout.stats, f"counts {stats[STATE]['count']} rows, and there are {rows}")
             elif rows is not None:
-                yield from (_wrong(layout, layout.stats, what) for what in _stats_differences(layout, stats))
+                yield from (wrong_file(layout, layout.stats, what) for what in _stats_differences(layout, stats))
     except DatasetError as error:
         yield error
 
@@ -239,21 +235,15 @@ def _check_entry(
         "dataset_to_index": end,
         "tasks": [about["task"]],
     }
-    with dataset_errors(layout.root, path, number):
+    with dataset_errors(layout, path, number):
         if place.entry not in entries:
             entries[place.entry] = read_entries(path)
         row = entries[place.entry][number]
         for key, value in expected.items():
             if row[key] != value:
-                raise DatasetError(
-                    f"{key} is {row[key]!r}, and must be {value!r}",
-                    file=str(path.relative_to(layout.root)),
-                    episode=number,
-                )
+                raise wrong_file(layout, path, f"{key} is {row[key]!r}, and must be {value!r}", number)
     if about["task"] not in tasks:
-        raise DatasetError(
-            f"the task {about['task']!r} is missing", file=str(layout.tasks.relative_to(layout.root)), episode=number
-        )
+        raise wrong_file(layout, layout.tasks, f"the task {about['task']!r} is missing", number)
     return end
 
 
@@ -261,7 +251,7 @@ def _count_rows(layout: DatasetLayout, path: Path) -> int:
     """Return the number of rows in a file, also of those that belong to no episode."""
     import pyarrow.parquet as pq
 
-    with dataset_errors(layout.root, path):
+    with dataset_errors(layout, path):
         return int(pq.read_metadata(path).num_rows)
 
 
@@ -293,25 +283,21 @@ def check_compatible(layout: DatasetLayout, about: Mapping[str, Any], cameras: S
     root = layout.root
     if root.exists() and not root.is_dir():
         raise CommandError(f"{root} is a file; a recording needs a folder", code="foreign_dataset")
+    foreign = f"the dataset in {root} was not recorded by this program; choose a new folder"
     if layout.info.exists() and not layout.numbers():
-        raise CommandError(
-            f"the dataset in {root} was not recorded by this program; choose a new folder", code="foreign_dataset"
-        )
+        raise CommandError(foreign, code="foreign_dataset")
     info = read_index(layout)
     if info is None:
         if root.is_dir() and not layout.episodes.is_dir() and any(root.iterdir()):
-            raise CommandError(
-                f"{root} holds other files than a recording; choose a new folder", code="foreign_dataset"
-            )
+            text = f"{root} holds other files than a recording; choose a new folder"
+            raise CommandError(text, code="foreign_dataset")
         return
     last = int(info["total_episodes"]) - 1
     if not layout.interrupted:
         check_next_episode(layout, info)
     if info["codebase_version"] != VERSION:
-        raise CommandError(
-            f"the dataset in {root} was not recorded by this program; choose a new folder", code="foreign_dataset"
-        )
-    found = format_differences(info, about)
+        raise CommandError(foreign, code="foreign_dataset")
+    found = [*format_differences(info, about)]
     if last >= 0:
         kept = {camera.name: {"streams": camera.more, "depth_unit_m": camera.depth_unit} for camera in cameras}
         found += hardware_differences(read_about(layout, last), {**about, "cameras": kept})
@@ -321,21 +307,12 @@ def check_compatible(layout: DatasetLayout, about: Mapping[str, Any], cameras: S
         )
 
 
-def format_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """Return the differences in columns, videos, rate and arms of two datasets, from their ``meta/info.json``."""
-    return [
-        *_settings(there, here["fps"], here.get("robot_type") or ""),
-        *_features(there["features"], here["features"]),
-    ]
-
-
-def _settings(info: Mapping[str, Any], fps: int, robot_type: str) -> Iterator[str]:
-    for name, new in (("fps", fps), ("robot_type", robot_type)):
-        if info.get(name) != new:
-            yield f"{name} is {info.get(name)} there, and {new} here"
-
-
-def _features(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+def format_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the differences in columns, videos, rate and arms of two datasets, from their ``meta/info.json``."""
+    for name, ours in (("fps", here["fps"]), ("robot_type", here.get("robot_type") or "")):
+        if there.get(name) != ours:
+            yield f"{name} is {there.get(name)} there, and {ours} here"
+    old, new = there["features"], here["features"]
     if missing := [key for key in old if key not in new]:
         yield f"only there: {', '.join(missing)}"
     if added := [key for key in new if key not in old]:
@@ -379,14 +356,10 @@ def _camera_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> Itera
     exact = [name for name in MORE_STREAMS if STREAMS[name].exact]
     for camera in (name for name in new if name in old):
         streams, ours = (each[camera].get("streams") or () for each in (old, new))
-        for stream in exact:
-            if (stream in streams) != (stream in ours):
-                where = "there, and not here" if stream in streams else "here, and not there"
-                yield f"{stream} of {camera} is kept {where}"
         there, here = (each[camera].get("depth_unit_m") for each in (old, new))
-        if there is None and here is not None:
-            yield f"depth of {camera} is not kept there, and is here"
-        elif there is not None and here is None:
-            yield f"depth of {camera} is kept there, and not here"
-        elif there is not None and here is not None and not math.isclose(there, here, rel_tol=1e-6):
+        kept = [("depth", there is not None, here is not None)]
+        for stream, before, now in (*kept, *((stream, stream in streams, stream in ours) for stream in exact)):
+            if before != now:
+                yield f"{stream} of {camera} is kept {'there, and not here' if before else 'here, and not there'}"
+        if there is not None and here is not None and not math.isclose(there, here, rel_tol=1e-6):
             yield f"depth of {camera} is in units of {1e3 * there:g} mm there, and {1e3 * here:g} mm here"

@@ -269,9 +269,7 @@ def _key_row(episode: Episode, row: int) -> int:
     if row == 0:
         return 0
     there = np.ones(row + 1, bool)
-    for camera in episode.cameras:
-        for path in episode.files(camera).values():
-            if path.suffix == ".mp4":
-                with dataset_errors(episode._layout.root, path, episode.number):
-                    there &= key_frames(path, episode.first_picture(path), row + 1, episode.fps)
+    for path in episode.picture_files(".mp4"):
+        with dataset_errors(episode._layout, path, episode.number):
+            there &= key_frames(path, episode.first_picture(path), row + 1, episode.fps)
     return int(np.flatnonzero(there)[-1]) if there.any() else 0

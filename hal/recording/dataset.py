@@ -32,7 +32,7 @@ from .layout import (
     require_libraries,
     video_key,
 )
-from .validation import dataset_errors
+from .validation import dataset_errors, wrong_file
 from .videos import count_frames, read_picture, read_video
 
 P = TypeVar("P", bound=NDArray[Any])
@@ -170,12 +170,8 @@ class Episode:
         self.__dict__.pop("_files", None)
 
     def _changed(self) -> DatasetError:
-        return DatasetError(
-            "another episode has this number since the dataset was opened: open it again",
-            file=self._name(self._about_file),
-            episode=self.number,
-            code="dataset_changed",
-        )
+        text = "another episode has this number since the dataset was opened: open it again"
+        return wrong_file(self._layout, self._about_file, text, self.number, "dataset_changed")
 
     def _check_current(self) -> None:
         """Raise DatasetError if a file that was just read may be of another episode."""
@@ -203,7 +199,7 @@ class Episode:
     @property
     def data_file(self) -> str:
         """The file of the rows, relative to the dataset's folder."""
-        return self._name(self._layout.data(self.place.data[0]))
+        return str(self._layout.data(self.place.data[0]).relative_to(self._layout.root))
 
     @cached_property
     def place(self) -> EpisodePlace:
@@ -242,7 +238,7 @@ class Episode:
         self._follow()
         file_number, first = self.place.data
         path = self._layout.data(file_number)
-        with dataset_errors(self._layout.root, path, self.number):
+        with dataset_errors(self._layout, path, self.number):
             version = file_version(path)
             ends = _group_ends(path, version)
             rows, end = ends[-1] if ends else 0, first + self.length
@@ -331,7 +327,7 @@ class Episode:
         """
         path = self._file_of(camera, "color")
         own = range(self.length)[row]
-        with dataset_errors(self._layout.root, path, self.number):
+        with dataset_errors(self._layout, path, self.number):
             found = read_picture(path, self.place.video(camera)[1] + own, self.fps)
         self._check_current()
         if found is None:
@@ -351,12 +347,16 @@ class Episode:
         return files[stream]
 
     def _depth_reader(self, path: Path) -> DepthReader:
-        with dataset_errors(self._layout.root, path, self.number):
+        with dataset_errors(self._layout, path, self.number):
             return DepthReader(path)
 
     def files(self, camera: str) -> dict[str, Path]:
         """Return the file of each stream of a camera; empty for a camera that was not recorded."""
         return dict(self._files.get(camera, {}))
+
+    def picture_files(self, suffix: str = "") -> list[Path]:
+        """Return the files of all streams of all cameras, or those with a suffix: ``.mp4`` or ``.depth``."""
+        return [path for files in self._files.values() for path in files.values() if path.name.endswith(suffix)]
 
     @cached_property
     def _files(self) -> dict[str, dict[str, Path]]:
@@ -380,8 +380,8 @@ class Episode:
     def file_versions(self) -> tuple[tuple[int, int] | None, ...]:
         """Return numbers that change when a file of the episode is written anew."""
         self._follow()
-        pictures = (path for camera in self.cameras for path in self.files(camera).values())
-        return tuple(map(file_version, (self._about_file, self._layout.root / self.data_file, *pictures)))
+        files = (self._about_file, self._layout.root / self.data_file, *self.picture_files())
+        return tuple(map(file_version, files))
 
     def first_picture(self, video: Path) -> int:
         """Return the number of the episode's first picture in a video of :meth:`files`."""
@@ -393,8 +393,8 @@ class Episode:
         Pictures are counted, not decoded, which takes milliseconds.
         """
         self._follow()
-        for path in (path for camera in self.cameras for path in self.files(camera).values()):
-            with dataset_errors(self._layout.root, path, self.number):
+        for path in self.picture_files():
+            with dataset_errors(self._layout, path, self.number):
                 if path.suffix == ".mp4":
                     self._check_count(path, count_frames(path, self.first_picture(path), self.length, self.fps))
                 else:
@@ -403,7 +403,7 @@ class Episode:
     def _yield_pictures(self, path: Path, pictures: Iterator[P], shape: tuple[int, ...]) -> Iterator[P]:
         """Yield one picture per row, each of ``shape``; pictures of a next episode may follow in a video."""
         count = 0
-        with dataset_errors(self._layout.root, path, self.number):
+        with dataset_errors(self._layout, path, self.number):
             for picture in islice(pictures, self.length + (path.suffix != ".mp4")):
                 if count == 0:  # the file is open
                     self._check_current()
@@ -421,10 +421,7 @@ class Episode:
             raise self._wrong(path, f"{found}, for {self.length} rows")
 
     def _wrong(self, path: Path, what: str) -> DatasetError:
-        return DatasetError(what, file=self._name(path), episode=self.number)
-
-    def _name(self, path: Path) -> str:
-        return str(path.relative_to(self._layout.root))
+        return wrong_file(self._layout, path, what, self.number)
 
     def __len__(self) -> int:
         return self.length
@@ -462,7 +459,7 @@ class CameraDepth(Sequence[NDArray[np.float32]]):
         if isinstance(row, slice):
             return [self[k] for k in range(*row.indices(len(self)))]
         own = range(len(self))[row]  # IndexError as it is: iteration ends with it
-        with dataset_errors(self._episode._layout.root, self._path, self._episode.number):
+        with dataset_errors(self._episode._layout, self._path, self._episode.number):
             found = self._reader[own]
         self._episode._follow()
         return found

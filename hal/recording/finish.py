@@ -414,9 +414,8 @@ def stats_of(episode: Episode) -> dict[str, Stats]:
     table = episode.read_table()
     stats = {key: column_stats(column_values(table[key])) for key in table.column_names}
     episode.check_pictures()
-    for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
-        if path.suffix == ".mp4":
-            with dataset_errors(episode._layout.root, path, episode.number):
-                first = episode.first_picture(path)
-                stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps, first).stats()
+    for path in episode.picture_files(".mp4"):
+        with dataset_errors(episode._layout, path, episode.number):
+            first = episode.first_picture(path)
+            stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps, first).stats()
     return stats

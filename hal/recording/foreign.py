@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import DatasetError
 from .index import read_entries, read_tasks, validated_info
-from .layout import CHUNK, GRID, MORE_STREAMS, DatasetLayout, current_key, read_json, video_key
+from .layout import CHUNK, GRID, MORE_STREAMS, DatasetLayout, current_key, read_json, video_key, video_names
 from .validation import dataset_errors
 
 _PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -44,7 +44,7 @@ def read_foreign(layout: DatasetLayout) -> ForeignDataset:
     Raises:
         DatasetError: It is damaged, or has a version of LeRobot's format that is not read (code ``foreign_dataset``).
     """
-    with dataset_errors(layout.root, layout.info):
+    with dataset_errors(layout, layout.info):
         info = read_json(layout.info)
         odd = [key for key, path in _PATHS.items() if info.get(key) not in (path, None)]
         if not str(info["codebase_version"]).startswith("v3.") or odd:
@@ -58,10 +58,10 @@ def read_foreign(layout: DatasetLayout) -> ForeignDataset:
         features = {key: _feature(each) for key, each in info["features"].items() if key not in left_out}
         info = validated_info(info | {"features": features, "fps": _whole(info["fps"])})
     entries = _entries(layout, info)
-    with dataset_errors(layout.root, layout.tasks):
+    with dataset_errors(layout, layout.tasks):
         tasks = read_tasks(layout.tasks)
     cameras = _cameras(features)
-    with dataset_errors(layout.root, layout.root / "meta/episodes"):
+    with dataset_errors(layout, layout.root / "meta/episodes"):
         abouts = [_about(info, entry, cameras, tasks) for entry in _places(layout, info, entries)]
     return ForeignDataset(info, abouts, (_notice(info, entries, cameras, left_out),))
 
@@ -102,9 +102,9 @@ def _entries(layout: DatasetLayout, info: Mapping[str, Any]) -> list[dict[str, A
     """Return the rows of ``meta/episodes``, without statistics, in the order of the episodes."""
     found: dict[int, dict[str, Any]] = {}
     for path in sorted(layout.root.glob("meta/episodes/*/*.parquet")):
-        with dataset_errors(layout.root, path):
+        with dataset_errors(layout, path):
             found |= read_entries(path)
-    with dataset_errors(layout.root, layout.info):
+    with dataset_errors(layout, layout.info):
         if sorted(found) != list(range(info["total_episodes"])):
             raise ValueError(f"it lists {info['total_episodes']} episodes, and meta/episodes has {len(found)}")
     return [found[number] for number in sorted(found)]
@@ -114,23 +114,23 @@ def _places(
     layout: DatasetLayout, info: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]
 ) -> Iterator[dict[str, Any]]:
     """Yield the row of each episode with ``files``: where its rows and pictures are."""
-    videos = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    videos = video_names(info["features"])
     starts: dict[int, int] = {}
     """Number of the first row of each file in the whole dataset."""
     for number, entry in enumerate(entries):
-        with dataset_errors(layout.root, layout.root / "meta/episodes", number):
+        with dataset_errors(layout, layout.root / "meta/episodes", number):
             start, rows = _count(entry["dataset_from_index"]), _count(entry["length"])
             if not 0 < rows == entry["dataset_to_index"] - start:
                 raise ValueError(f"its length is {rows}, from row {start} to {entry['dataset_to_index']}")
             file = _file(entry, "data")
             first = start - starts.setdefault(file, start)
             places = {}
-            for key in videos:
-                lead = f"videos/{key}"
+            for name in videos:
+                lead = f"videos/{video_key(name)}"
                 begin, end = (float(entry[f"{lead}/{side}_timestamp"]) * info["fps"] for side in ("from", "to"))
                 if not (math.isfinite(begin) and begin > -0.5 and abs(end - begin - rows) < 0.5):
-                    raise ValueError(f"{key} has pictures {begin:g} to {end:g} for {rows} rows")
-                places[key.removeprefix(video_key(""))] = [_file(entry, lead), round(begin)]
+                    raise ValueError(f"{name} has pictures {begin:g} to {end:g} for {rows} rows")
+                places[name] = [_file(entry, lead), round(begin)]
         yield {**entry, "files": {"index": 0, "data": [file, first], "videos": places}}
 
 
@@ -150,8 +150,7 @@ def _file(entry: Mapping[str, Any], lead: str) -> int:
 
 def _cameras(features: Mapping[str, Any]) -> list[str]:
     """Return the names of the cameras: of the videos, without the further streams of a camera."""
-    prefix = video_key("")
-    videos = [key.removeprefix(prefix) for key, feature in features.items() if feature["dtype"] == "video"]
+    videos = video_names(features)
     further = {f"{name}_{stream}" for name in videos for stream in MORE_STREAMS}
     return [name for name in videos if name not in further]
 

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..errors import DatasetError
 from .about import read_about
 from .codecs import Stats, merge_stacked, merge_stats
 from .layout import CHUNK, DatasetLayout, EpisodePlace, read_json, video_names
-from .validation import CameraName, Feature, Model, dataset_errors
+from .validation import CameraName, Feature, Model, dataset_errors, wrong_file
 
 _TASK = "__index_level_0__"
 """LeRobot 0.4's name of the column of texts in ``meta/tasks.parquet``; 0.6's is ``task``, and it reads both."""
@@ -55,28 +54,18 @@ def read_index(layout: DatasetLayout) -> dict[str, Any] | None:
         found = next(layout.finished(), None)
         if found is None or layout.interrupted:
             return None
-        raise DatasetError(
-            f"is missing, but there are finished episodes ({found.relative_to(layout.root)}); nothing is recorded "
-            f"over them. Rebuild the index from the episodes with: {repair_command(layout)}",
-            file="meta/info.json",
-            code="index_missing",
-        )
+        text = f"is missing, but there are finished episodes ({found.relative_to(layout.root)}); nothing is recorded "
+        text += f"over them. Rebuild the index from the episodes with: {repair_command(layout)}"
+        raise wrong_file(layout, layout.info, text, code="index_missing")
     if not layout.episodes.is_dir():
-        raise DatasetError(
-            f"{layout.root} was not recorded by this program: it has no folder episodes",
-            file="meta/info.json",
-            code="foreign_dataset",
-        )
-    with dataset_errors(layout.root, layout.info):
+        text = f"{layout.root} was not recorded by this program: it has no folder episodes"
+        raise wrong_file(layout, layout.info, text, code="foreign_dataset")
+    with dataset_errors(layout, layout.info):
         info = validated_info(read_json(layout.info))
     last = info["total_episodes"] - 1
     if last >= 0 and not any(path.exists() for path in layout.files_of(last, EpisodePlace.of(last, {}), ())):
-        raise DatasetError(
-            f"lists {last + 1} episodes, and there is no file of episode {last}; to rebuild it: "
-            f"{repair_command(layout)}",
-            file="meta/info.json",
-            code="index_wrong",
-        )
+        text = f"lists {last + 1} episodes, and there is no file of episode {last}; to rebuild it: "
+        raise wrong_file(layout, layout.info, text + repair_command(layout), code="index_wrong")
     return info
 
 
@@ -97,20 +86,13 @@ def check_next_episode(layout: DatasetLayout, info: dict[str, Any] | None) -> No
     videos = video_names(info["features"]) if info is not None else []
     for path in layout.files_of(number, next_place(layout, info), videos):
         if path.exists():
-            raise DatasetError(
-                f"exists, but meta/info.json does not list this episode; nothing is recorded over it. Rebuild the "
-                f"index from the episodes with: {repair_command(layout)}",
-                file=str(path.relative_to(layout.root)),
-                episode=number,
-                code="index_wrong",
-            )
+            text = "exists, but meta/info.json does not list this episode; nothing is recorded over it. Rebuild the "
+            text += f"index from the episodes with: {repair_command(layout)}"
+            raise wrong_file(layout, path, text, number, "index_wrong")
     for path in (layout.stats, layout.tasks) if number else ():
         if not path.exists():
-            raise DatasetError(
-                f"is missing; rebuild it with: {repair_command(layout)}",
-                file=str(path.relative_to(layout.root)),
-                code="index_wrong",
-            )
+            text = f"is missing; rebuild it with: {repair_command(layout)}"
+            raise wrong_file(layout, path, text, code="index_wrong")
 
 
 def stray_files(
@@ -173,7 +155,7 @@ def stats_parts(layout: DatasetLayout) -> Iterator[tuple[str, dict[str, NDArray[
     Raises DatasetError if a file is damaged.
     """
     for path in sorted(layout.entry(0).parent.parent.glob("*/*.parquet")):
-        with dataset_errors(layout.root, path):
+        with dataset_errors(layout, path):
             yield from read_stats(read_table(path)).items()
 
 

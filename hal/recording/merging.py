@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CommandError, DatasetError
+from ..errors import CommandError
 from .about import split_about
 from .changing import existing_episodes, refuse_foreign
 from .checking import format_differences, hardware_differences
@@ -44,7 +44,7 @@ from .layout import (
     video_names,
     write_json,
 )
-from .validation import dataset_errors
+from .validation import dataset_errors, wrong_file
 from .videos import VideoPart, can_be_joined, join_videos
 
 _LOG = logging.getLogger("hal.recording")
@@ -244,8 +244,8 @@ def _sources(
         check_next_episode(layout, dataset.info)  # episodes that the index lacks would be lost
         places = [(episode.number, episode.place) for episode in dataset.episodes]
         if strays := stray_files(layout, places, video_names(dataset.info["features"])):
-            file = str(strays[0].relative_to(layout.root))
-            raise DatasetError("belongs to no episode and would be lost: move it", file=file, code="index_wrong")
+            text = "belongs to no episode and would be lost: move it"
+            raise wrong_file(layout, strays[0], text, code="index_wrong")
     for dataset in datasets[1:]:
         about = (each.episodes[0].info for each in (datasets[0], dataset))
         found = [*format_differences(datasets[0].info, dataset.info), *hardware_differences(*about)]
@@ -354,7 +354,7 @@ class DatasetBuilder:
             if len(runs) == 1 and runs[0].whole:
                 link_file(runs[0].part.path, target)
             else:
-                with dataset_errors(self.layout.root, runs[0].part.path):
+                with dataset_errors(self.layout, runs[0].part.path):
                     join_videos([run.part for run in runs], target, self.fps)
         places, file, first = [], 0, 0
         sizes = [sum(run.part.length for run in runs) for runs in files]
@@ -376,7 +376,7 @@ class DatasetBuilder:
         for _, episode, _ in self.sources:
             file, first = episode.place.video(name)
             path = episode._layout.video(name, file)
-            with dataset_errors(episode._layout.root, path, episode.number):
+            with dataset_errors(episode._layout, path, episode.number):
                 path.stat()
             last = parts[-1] if parts else None
             if last is not None and (last.path, last.first + last.length) == (path, first):
@@ -399,7 +399,7 @@ class DatasetBuilder:
         data.parent.mkdir(parents=True, exist_ok=True)
         kept = self._kept_rows(numbers)
         if kept is not None:
-            with dataset_errors(self.sources[begin].dataset.root, kept):
+            with dataset_errors(self.sources[begin].episode._layout, kept):
                 link_file(kept, data)
         else:
             self._write_rows(data, numbers)
@@ -422,14 +422,13 @@ class DatasetBuilder:
         return len(numbers), {key: merge_stacked(found) for key, found in read_stats(entries).items()}
 
     def _add_depth(self, episode: Episode, number: int) -> None:
-        for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
-            if path.suffix == ".depth":
-                with dataset_errors(episode._layout.root, path, episode.number):
-                    target = self.layout.depth(path.parent.parent.name, number)
-                    if episode.rows is None:
-                        link_file(path, target)
-                    else:
-                        copy_records(path, target, *episode.rows)
+        for path in episode.picture_files(".depth"):
+            with dataset_errors(episode._layout, path, episode.number):
+                target = self.layout.depth(path.parent.parent.name, number)
+                if episode.rows is None:
+                    link_file(path, target)
+                else:
+                    copy_records(path, target, *episode.rows)
 
     def _write_about(self, episode: Episode, number: int, about: Mapping[str, Any]) -> None:
         own, name, common = split_about(about)
@@ -445,7 +444,7 @@ class DatasetBuilder:
         """Return the row of an episode of the result in the index of its part, without the statistics."""
         episode = self.sources[number].episode
         path = episode._layout.entry(episode.place.entry)
-        with dataset_errors(episode._layout.root, path, episode.number):
+        with dataset_errors(episode._layout, path, episode.number):
             return self._entries(path)[episode.number]
 
     def _change_columns(self, number: int) -> dict[str, NDArray[Any]]:
@@ -470,7 +469,7 @@ class DatasetBuilder:
         for number in numbers:
             episode = self.sources[number].episode
             path = episode._layout.entry(episode.place.entry)
-            with dataset_errors(episode._layout.root, path, episode.number):
+            with dataset_errors(episode._layout, path, episode.number):
                 table, places = self._tables(path)
                 row = places[episode.number]
             if episode.rows is not None:
@@ -481,8 +480,7 @@ class DatasetBuilder:
             runs.append((table, row, 1))
             there = {name.split("/")[1] for name in table.column_names}
             if missing := [key for key in self.features if key not in there]:
-                file = str(path.relative_to(episode._layout.root))
-                raise DatasetError(f"has no statistics of {', '.join(missing)}", file=file, episode=episode.number)
+                raise wrong_file(episode._layout, path, f"has no statistics of {', '.join(missing)}", episode.number)
         for table, row, count in runs:
             part = table.slice(row, count)
             tables.append(part if not tables else part.select(tables[0].column_names).cast(tables[0].schema))
@@ -495,7 +493,7 @@ class DatasetBuilder:
         for number in numbers:
             _, episode, label = self.sources[number]
             entry = self._entry(number)
-            with dataset_errors(episode._layout.root, episode._layout.tasks):
+            with dataset_errors(episode._layout, episode._layout.tasks):
                 known = self._tasks(episode._layout.tasks)
             if (
                 episode.rows is not None
@@ -524,7 +522,7 @@ class DatasetBuilder:
             for number in numbers:
                 episode = self.sources[number].episode
                 table = episode.read_table().replace_schema_metadata()
-                with dataset_errors(episode._layout.root, episode._layout.root / episode.data_file, episode.number):
+                with dataset_errors(episode._layout, episode._layout.root / episode.data_file, episode.number):
                     for key, values in self._change_columns(number).items():
                         table = table.set_column(table.schema.get_field_index(key), key, pa.array(values))
                     if file is None:

@@ -392,7 +392,7 @@ class EpisodeRecorder:
             "recovered": False,
             "dropped": self.dropped.rows,
             "late": self.clock.late,
-            "gaps": self.dropped.as_json(),
+            "gaps": self.dropped.gaps,
             "repeated": {buffer.camera.name: buffer.repeated for buffer in self._buffers},
             "trouble": self.trouble,
             "result": make_plain(dict(result or {})),
@@ -465,8 +465,9 @@ class DroppedRows:
         """Time since the last row that could be made, s."""
         self.why = ""
         """The newest reason."""
+        self.gaps: list[dict[str, Any]] = []
+        """The gaps, as the episode's file lists them."""
         self._fps = fps
-        self._found: list[dict[str, Any]] = []
         self._is_open = False
 
     def add(self, t: float, why: str) -> None:
@@ -475,19 +476,15 @@ class DroppedRows:
         self.lasting += 1.0 / self._fps
         self.why = why
         if not self._is_open:
-            self._found.append({"from_s": round(t, 6), "rows": 0, "why": why})
+            self.gaps.append({"from_s": round(t, 6), "rows": 0, "why": why})
             self._is_open = True
-        self._found[-1]["rows"] += 1
-        self._found[-1]["to_s"] = round(t, 6)
+        self.gaps[-1]["rows"] += 1
+        self.gaps[-1]["to_s"] = round(t, 6)
 
     def row_made(self) -> None:
         """End the current gap."""
         self._is_open = False
         self.lasting = 0.0
-
-    def as_json(self) -> list[dict[str, Any]]:
-        """Return the gaps as the episode's file lists them."""
-        return self._found
 
 
 def check_rate(rig: Rig, fps: int) -> None:

@@ -31,7 +31,7 @@ from .layout import (
     video_names,
     write_json,
 )
-from .validation import dataset_errors
+from .validation import dataset_errors, wrong_file
 
 
 def recover(out: str | Path) -> list[str]:
@@ -113,7 +113,7 @@ def _rebuild_all(layout: DatasetLayout) -> int:
     strays = stray_files(layout, places, video_names(info["features"]))
     for path in strays:
         if not path.is_relative_to(layout.info.parent):
-            raise DatasetError("belongs to no episode in episodes/", file=str(path.relative_to(layout.root)))
+            raise wrong_file(layout, path, "belongs to no episode in episodes/")
     tasks: dict[int, str] = {}
     parts: dict[str, list[Stats]] = {}
     entries: dict[int, list[dict[str, Any]]] = {}
@@ -154,7 +154,7 @@ def _info(layout: DatasetLayout, count: int) -> dict[str, Any]:
     if kept:
         return new_info(*kept[0])
     try:
-        with dataset_errors(layout.root, layout.info):
+        with dataset_errors(layout, layout.info):
             return validated_info(read_json(layout.info))
     except DatasetError as error:
         raise DatasetError(

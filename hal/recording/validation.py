@@ -11,6 +11,7 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import DatasetError, HalError
+from .layout import DatasetLayout
 
 _SIDE = 16384
 """Pixels; no picture is larger."""
@@ -48,7 +49,7 @@ class Feature(Model):
 
 
 @contextlib.contextmanager
-def dataset_errors(root: Path, path: Path, episode: int | None = None) -> Iterator[None]:
+def dataset_errors(layout: DatasetLayout, path: Path, episode: int | None = None) -> Iterator[None]:
     """Raise any error of a missing or damaged file as a DatasetError that names the file and the episode.
 
     A disk that refuses what is written meanwhile is no damage: its OSError is raised as it is.
@@ -60,8 +61,15 @@ def dataset_errors(root: Path, path: Path, episode: int | None = None) -> Iterat
     except Exception as error:
         if isinstance(error, OSError) and error.errno in _DISK_REFUSES:
             raise
-        file = str(path.relative_to(root)) if path.is_relative_to(root) else str(path)
-        raise DatasetError(_reason(error), file=file, episode=episode) from error
+        raise wrong_file(layout, path, _reason(error), episode) from error
+
+
+def wrong_file(
+    layout: DatasetLayout, path: Path, what: str, episode: int | None = None, code: str | None = None
+) -> DatasetError:
+    """Return the error of a file, which it names relative to the dataset's folder."""
+    file = str(path.relative_to(layout.root)) if path.is_relative_to(layout.root) else str(path)
+    return DatasetError(what, file=file, episode=episode, code=code)
 
 
 def _reason(error: Exception) -> str:

@@ -7,7 +7,7 @@ nothing recorded before is lost. If the disk fails, it reports that, closes what
 from __future__ import annotations
 
 import contextlib
-import os
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -163,8 +163,7 @@ def free_bytes(path: Path) -> int:
     """Return the free space of the file system that holds ``path``, or will hold it, bytes."""
     while not path.exists() and path != path.parent:
         path = path.parent
-    found = os.statvfs(path)
-    return found.f_bavail * found.f_frsize
+    return shutil.disk_usage(path).free
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
