@@ -31,7 +31,7 @@ from pydantic import Field
 from hal.camera import frame_from_color
 from hal.config.files import Problems, validate
 from hal.config.schema import Flag, Strict, describe
-from hal.errors import ConfigError
+from hal.errors import ConfigError, Problem
 from hal.specs import CameraSpec, SensorSpec
 
 Image = NDArray[np.float32]
@@ -82,37 +82,32 @@ _OPTIONS: dict[str, type[StereoNoiseOptions] | type[LidarNoiseOptions]] = {
 
 def check(spec: CameraSpec) -> Iterator[tuple[str, str, str]]:
     """Yield (key in the camera's entry of the rig, message, code) for each problem in a simulated camera's options."""
-    problems = Problems()
-    _read_options(spec, problems)
-    for problem in problems.found:
-        yield problem.key, problem.message, problem.code
+    try:
+        noise_of(spec)
+    except ConfigError as error:
+        for problem in error.problems:
+            yield problem.key, problem.message, problem.code
 
 
 def noise_of(spec: CameraSpec) -> NoiseOptions | None:
     """Return the options of this camera's depth noise, None without noise; raises ConfigError, which lists problems."""
     problems = Problems()
-    found = _read_options(spec, problems)
-    if problems.found:
-        raise ConfigError(problems.found)
-    return found
-
-
-def _read_options(spec: CameraSpec, problems: Problems) -> NoiseOptions | None:
     given = validate(_CameraOptions, spec.options, "", problems, "simulated").depth_noise
-    if given is False or problems.found:
+    problems.raise_any()
+    if given is False:
         return None
     key = "simulated.depth_noise"
     if spec.depth_sensor is None:
-        problems.add("", key, f"is not known for model {spec.model!r}, which has no depth_sensor", "conflict")
-        return None
+        message = f"is not known for model {spec.model!r}, which has no depth_sensor"
+        raise ConfigError([Problem("", key, message, "conflict")])
     kind = _OPTIONS[spec.depth_sensor.kind]
     if given is not True and not isinstance(given, Mapping):
         keys = ", ".join(kind.model_fields)
         message = f"must be true, false or keys and values, not {describe(given)}; keys: {keys}"
-        problems.add("", key, message, "wrong_type")
-        return None
+        raise ConfigError([Problem("", key, message, "wrong_type")])
     found = validate(kind, {} if given is True else given, "", problems, key)
-    return None if problems.found else found
+    problems.raise_any()
+    return found
 
 
 # --- noise -----------------------------------------------------------------------------------------------------------

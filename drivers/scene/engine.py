@@ -211,11 +211,14 @@ class SceneEngine(WorldDriver, Generic[B]):
 
     @abstractmethod
     def find_contacts(self, a: B | None, b: B | None) -> list[dict[str, Any]]:
-        """Return the contacts of the last step, as :meth:`contacts` does; None stands for any body."""
+        """Return the contacts of the last step, each as the fields of a :class:`hal.world.Contact`; None: any body."""
 
     @abstractmethod
     def measure_box(self, body: B) -> tuple[list[float], list[float]]:
-        """Return the lower and upper corner (3,) m of the box along the world's axes around a body."""
+        """Return the lower and upper corner (3,) m of the box along the world's axes around a body.
+
+        It may be larger by the engine's collision margin (mm).
+        """
 
     @abstractmethod
     def place_mirror(self, body: B, q: list[float], dq: list[float], width: float | None) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from hal.host.memory import SeriesBox
 
@@ -13,24 +12,10 @@ from .drawn import DrawnWorld
 from .world import SimulatedWorld
 
 
-class MirrorWorld(Protocol):
-    """A world that repeats edits and is posed by snapshots."""
-
-    @property
-    def revision(self) -> int:
-        """Number of edits so far."""
-
-    def request(self, method: str, params: dict[str, Any]) -> Any:
-        """Repeat an edit."""
-
-    def show(self, snapshot: Sequence[float]) -> None:
-        """Place every body as in a snapshot of the same revision."""
-
-
 class WorldMirror:
     """Poses a copy of the world by the snapshots and the edits of the world that is stepped in another process."""
 
-    def __init__(self, world: MirrorWorld, snapshots: SeriesBox) -> None:
+    def __init__(self, world: DrawnWorld, snapshots: SeriesBox) -> None:
         self._world = world
         self._snapshots = snapshots
         self._edits: dict[int, tuple[str, dict[str, Any]]] = {}

@@ -163,7 +163,7 @@ class SimulatedWorld(SceneEngine[B]):
                 text = f"{one} starts {depth:.3f} m inside {other}, which may push it out to any side"
                 self.warnings.append(f"{text}: change its position")
 
-    # --- requests of rig.world ---------------------------------------------------------------------------------------
+    # --- requests of rig.world: their parameters and results are in hal.world.WorldDriver ----------------------------
 
     def request(self, method: str, params: Mapping[str, Any]) -> Any:
         if method not in self.REQUESTS:
@@ -196,12 +196,10 @@ class SimulatedWorld(SceneEngine[B]):
         }
 
     def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
-        """Return the pose of a link's frame in the world; of the base link when none is named."""
         body = self.body(name)
         return pose_json(self.read_pose(body, self.link(body, link)))
 
     def poses(self, names: Sequence[str] | None = None) -> dict[str, Any]:
-        """Return ``poses`` of base links by name, of all bodies for None, and ``t``, the simulated time, s."""
         found = self.bodies.values() if names is None else [self.body(name) for name in names]
         poses = {body.name: pose_json(self.read_pose(body, self.link(body, None))) for body in found}
         return {"t": self.t, "poses": poses}
@@ -217,7 +215,6 @@ class SimulatedWorld(SceneEngine[B]):
         self.move_base(body, there)
 
     def joint_positions(self, name: str) -> dict[str, float]:
-        """Return the position of each joint that moves, rad or m, in the order of the URDF."""
         body = self.body(name)
         return dict(zip(movable_joints(body), self.read_joints(body), strict=True))
 
@@ -230,13 +227,11 @@ class SimulatedWorld(SceneEngine[B]):
         self.move_joints(body, wanted)
 
     def velocity(self, name: str) -> list[list[float]]:
-        """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
         return [list(part) for part in self.read_velocity(self.body(name))]
 
     def set_velocity(
         self, name: str, linear: Sequence[float] = (0.0, 0.0, 0.0), angular: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
-        """Set the velocity, as :meth:`velocity` returns it, of a body with a free base."""
         body = self.body(name)
         if not body.floating:
             raise CommandError(f"the base of {name!r} is fixed: it has no velocity to set", code="base_fixed")
@@ -276,7 +271,6 @@ class SimulatedWorld(SceneEngine[B]):
         self.forces = [force for force in self.forces if force.steps > 0]
 
     def set_gravity(self, gravity: Sequence[float]) -> list[float]:
-        """Set the gravity, (3,) m/s2 in the world, and return the previous one."""
         before, self._gravity = self._gravity, numbers("gravity", gravity, 3)
         self.write_gravity(self._gravity)
         return before
@@ -311,15 +305,10 @@ class SimulatedWorld(SceneEngine[B]):
         return found
 
     def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
-        """Return those of :data:`.values.DYNAMICS` that the engine has."""
         body = self.body(name)
         return self.read_dynamics(body, self.link(body, link))
 
     def set_dynamics(self, name: str, link: str | None = None, **values: Any) -> dict[str, Any]:
-        """Set some values of :meth:`dynamics`, check that the engine took them, and return the previous ones.
-
-        A new mass scales the inertia with it unless an inertia is given.
-        """
         body = self.body(name)
         number = self.link(body, link)
         wanted = dynamics_values(name, values)
@@ -338,14 +327,6 @@ class SimulatedWorld(SceneEngine[B]):
         return {key: before[key] for key in wanted}
 
     def contacts(self, a: str | None = None, b: str | None = None, stamped: bool = False) -> Any:
-        """Return the contacts of the last step: all, those of ``a``, or those between ``a`` and ``b``.
-
-        There are none after an edit or a reset: no step has computed any. With ``stamped`` they are ``contacts`` of a
-        dict that has the time of the step, s, or None, as ``t``.
-
-        Each is a dict of ``a``, ``b``, ``link_a``, ``link_b``, ``position`` (3,) m on ``b``, ``normal`` (3,) from ``b``
-        towards ``a``, ``distance`` m, negative where they overlap, and ``force`` N along the normal.
-        """
         if a is None:
             a, b = b, None
         first, second = (None if name is None else self.body(name) for name in (a, b))
@@ -359,15 +340,10 @@ class SimulatedWorld(SceneEngine[B]):
         self._edited_at = self.steps
 
     def aabb(self, name: str) -> dict[str, list[float]]:
-        """Return ``lower`` and ``upper`` (3,) m, the corners of the box along the world's axes around the body.
-
-        It may be larger by the engine's collision margin (mm).
-        """
         lower, upper = self.measure_box(self.body(name))
         return {"lower": lower, "upper": upper}
 
     def add(self, spec: Mapping[str, Any] | BodySpec) -> int:
-        """Add an object and return the new revision."""
         record = spec if isinstance(spec, BodySpec) else body_spec(spec)
         check_body(record)
         problems = self._attachment_problems([record])
@@ -378,7 +354,6 @@ class SimulatedWorld(SceneEngine[B]):
         return self._publish_edit("add", spec=to_json(record))
 
     def remove(self, name: str) -> int:
-        """Remove an object, not a robot, and return the new revision."""
         body = self.body(name)
         if body.is_robot:
             raise CommandError(f"{name!r} is a robot: robots stay in the world", code="is_robot")
@@ -390,7 +365,6 @@ class SimulatedWorld(SceneEngine[B]):
         return self._publish_edit("remove", name=name)
 
     def set_color(self, name: str, rgba: Sequence[float]) -> int:
-        """Set the colour of all links of a body (red, green, blue, alpha in 0..1) and return the new revision."""
         self.body(name)
         color = numbers("rgba", rgba, 4)
         if not all(0.0 <= value <= 1.0 for value in color):
@@ -398,7 +372,6 @@ class SimulatedWorld(SceneEngine[B]):
         return self._publish_edit("set_color", name=name, rgba=color)
 
     def randomize(self, values: Mapping[str, Any], seed: int) -> int:
-        """Take the values that devices and pictures read (see :mod:`hal.randomization`) and return the new revision."""
         self.randomized = Randomized.take(values, seed)
         return self._publish_edit("randomize", values=dict(values), seed=seed)
 
