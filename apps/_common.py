@@ -246,7 +246,7 @@ def resolve_plan(
     """
     from hal.apps.check import may_open
     from hal.config import load
-    from hal.config.files import suggest
+    from hal.errors import suggest
 
     try:
         plan = load(**config_options(args), clock=clock).resolve()

@@ -114,7 +114,7 @@ def _find_program(name: str) -> Callable[[list[str]], int]:
         return main
     from importlib.metadata import entry_points  # slow to import, so only when it is needed
 
-    from hal.config.files import suggest
+    from hal.errors import suggest
 
     for point in entry_points(group=GROUP, name=name):
         loaded: Callable[[list[str]], int] = point.load()

@@ -21,8 +21,9 @@ Each is also the builtin error in brackets. Every error has a ``code``, a stable
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
@@ -198,6 +199,19 @@ class DriverMissing(HalError, ImportError):
         super().__init__(*args, code=code)
         self.name = name
         """Import name of the library, as for any ImportError; None if there is no single one."""
+
+
+def find_closest(word: str, choices: Iterable[str]) -> str | None:
+    """Return the one of ``choices`` that ``word`` probably means; None if none is near."""
+    return next(iter(get_close_matches(word, sorted(choices), n=1)), None)
+
+
+def suggest(word: str, choices: Iterable[str]) -> str:
+    """Return ``"; did you mean ...? available: ..."`` for a name that is not among ``choices``."""
+    known = sorted(choices)
+    close = find_closest(word, known)
+    hint = f"; did you mean {close!r}?" if close else ";"
+    return f"{hint} available: {', '.join(known)}" if known else "; none are available"
 
 
 def import_library(name: str, why: str, install: str) -> Any:

@@ -18,11 +18,10 @@ import importlib
 import importlib.util
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any, Literal
 
-from .errors import DeviceNotFound, DriverMissing, NotSupported
+from .errors import DeviceNotFound, DriverMissing, NotSupported, suggest
 
 PadInput = Literal["plugged", "console", "keys", "recording", "program"]
 """Source of a gamepad's input: a pad that is plugged in, the console's page, the keys of the terminal, a recording, or
@@ -179,10 +178,7 @@ def driver(name: str) -> DriverSpec:
     if place is None:
         place = _entry_points().get(name)
     if place is None:
-        raise DeviceNotFound(
-            f"there is no driver {name!r}{_suggest(name, names())}; drivers: {', '.join(names())}",
-            code="unknown_driver",
-        )
+        raise DeviceNotFound(f"there is no driver {name!r}{suggest(name, names())}", code="unknown_driver")
     spec = _resolve(place, name, {})
     if not isinstance(spec, DriverSpec):
         raise DriverMissing(
@@ -230,7 +226,7 @@ def explain_engine(choice: str) -> str | None:
     if choice == "auto" or (choice != SIMULATION and is_engine(choice)):
         return None
     there = ("auto", *ENGINES, *(name for name in _entry_points() if is_engine(name)))
-    return f"{choice!r} is no engine{_suggest(choice, there)}: {', '.join(there)}, or a driver with a world"
+    return f"{choice!r} is no engine{suggest(choice, there)}, or a driver with a world"
 
 
 def choose_engine(choice: str) -> str:
@@ -289,10 +285,7 @@ def load(name: str, kind: str) -> Any:
     """
     spec = driver(name)
     if kind not in _KINDS:
-        raise NotSupported(
-            f"there is no kind of driver {kind!r}{_suggest(kind, _KINDS)}; kinds: {', '.join(_KINDS)}",
-            code="unknown_kind",
-        )
+        raise NotSupported(f"there is no kind of driver {kind!r}{suggest(kind, _KINDS)}", code="unknown_kind")
     place = getattr(spec, kind)
     if place is None:
         raise NotSupported(
@@ -363,8 +356,3 @@ def _entry_points() -> dict[str, str]:
     from importlib.metadata import entry_points  # slow to import, so only when it is needed
 
     return {point.name: point.value for point in entry_points(group=GROUP)}
-
-
-def _suggest(word: str, choices: tuple[str, ...]) -> str:
-    close = get_close_matches(word, choices, n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""

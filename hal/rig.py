@@ -10,7 +10,6 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -20,7 +19,7 @@ from . import registry
 from .camera import Camera, find_place
 from .clock import Clock, LockStepClock, RealClock
 from .commands import StopLatch
-from .errors import CommandError, ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
+from .errors import CommandError, ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem, suggest
 from .gamepad import Gamepad
 from .gripper import Gripper
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups, start_processes
@@ -560,10 +559,7 @@ class Devices(dict[str, T]):
         self._kind = kind
 
     def __missing__(self, name: str) -> T:
-        close = get_close_matches(name, self, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        there = ", ".join(self) if self else "none"
-        raise DeviceNotFound(f"this rig has no {self._kind} {name!r}{hint}; it has: {there}", code=f"no_{self._kind}")
+        raise DeviceNotFound(f"this rig has no {self._kind} {name!r}{suggest(name, self)}", code=f"no_{self._kind}")
 
     if not TYPE_CHECKING:  # so that type checkers still report unknown attributes
 

@@ -19,8 +19,16 @@ from typing import Any
 
 import can
 
-from hal.config.files import find_closest
-from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, DriverMissing, Fault, HalError, Problem
+from hal.errors import (
+    ConfigError,
+    ConnectionLost,
+    DeviceNotFound,
+    DriverMissing,
+    Fault,
+    HalError,
+    Problem,
+    find_closest,
+)
 
 from .settings import BusSettings
 

@@ -15,8 +15,9 @@ from zlib import crc32
 
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, model_validator
 
-from hal.config.files import DeviceSettings, find_closest
+from hal.config.files import DeviceSettings
 from hal.config.schema import Flag, Quantity, Several, Size, Strict, describe
+from hal.errors import find_closest
 from hal.kinematics.inertials import find_wrong_inertials
 from hal.specs import GripperSpec, RobotSpec
 

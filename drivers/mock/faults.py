@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from difflib import get_close_matches
 from typing import Any, ClassVar, Generic, TypeVar
 
-from hal.errors import CommandError, ConnectionLost
+from hal.errors import CommandError, ConnectionLost, suggest
 
 
 @dataclass(frozen=True)
@@ -112,9 +111,7 @@ class MockDevice(Generic[_F]):
         known = [f.name for f in fields(self.faults)]
         for name, value in faults.items():
             if name not in known:
-                close = get_close_matches(name, known, n=1)
-                hint = f" (did you mean {close[0]!r}?)" if close else ""
-                raise CommandError(f"unknown fault {name!r}{hint}; faults: {', '.join(known)}", code="unknown_fault")
+                raise CommandError(f"unknown fault {name!r}{suggest(name, known)}", code="unknown_fault")
             expected = _describe_expected(name, value, _GARBAGE.get(type(self.faults), ()))
             if expected is not None:
                 raise CommandError(f"{name} must be {expected}, not {value!r}", code="bad_fault_value")

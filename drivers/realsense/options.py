@@ -8,7 +8,6 @@ depth sensor and the colour sensor both have it (``exposure``, ``gain``), it is 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
@@ -16,7 +15,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from hal.config.files import DeviceSettings
 from hal.config.schema import Flag, Quantity, Seconds, ValueProblem, describe, is_number
-from hal.errors import CommandError, NotSupported
+from hal.errors import CommandError, NotSupported, find_closest
 from hal.specs import CameraSpec
 
 COLOR_FORMATS = ("rgb8", "bgr8", "rgba8", "bgra8", "yuyv", "uyvy")
@@ -331,8 +330,8 @@ def _describe_range(limits: Any) -> str:
 
 def _describe_unknown(name: str, sensors: Sensors) -> str:
     known = {place: sorted(_list_options(sensor), key=lambda pair: pair[0]) for place, sensor in sensors.items()}
-    close = get_close_matches(name, [known_name for pairs in known.values() for known_name, _ in pairs], n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    close = find_closest(name, (known_name for pairs in known.values() for known_name, _ in pairs))
+    hint = f" (did you mean {close!r}?)" if close else ""
     lines = [f"this camera has no option {name!r}{hint}; it has:"]
     for place, pairs in known.items():
         lines += [f"  {place}.{known_name}: {_describe_option(sensors[place], option)}" for known_name, option in pairs]

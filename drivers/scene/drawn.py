@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.errors import ConfigError, DeviceNotFound, Problem
+from hal.errors import ConfigError, DeviceNotFound, Problem, suggest
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfModel, UrdfVisual
 from hal.randomization import COUNT
@@ -25,7 +25,7 @@ from .disturbances import UNCHANGED, Randomized
 from .lighting import BACKGROUND, Light, Look
 from .shapes import Visual
 from .urdf_files import absent_packages, checked_urdf, drawn_visuals, has_free_base, where_to_get
-from .values import body_spec, nearest
+from .values import body_spec
 
 Array = NDArray[np.float64]
 
@@ -300,10 +300,10 @@ class DrawnWorld:
         Raises DeviceNotFound, which lists the existing bodies or links.
         """
         if name not in self.bodies:
-            raise DeviceNotFound(f"the world has no body {name!r}{nearest(name, self.bodies)}", code="unknown_body")
+            raise DeviceNotFound(f"the world has no body {name!r}{suggest(name, self.bodies)}", code="unknown_body")
         body = self.bodies[name]
         if link is not None and link not in body.links:
-            raise DeviceNotFound(f"{name!r} has no link {link!r}{nearest(link, body.links)}", code="unknown_link")
+            raise DeviceNotFound(f"{name!r} has no link {link!r}{suggest(link, body.links)}", code="unknown_link")
         frame = self._link(body, link)
         return {"position": frame[:3, 3].tolist(), "orientation": matrix_to_quaternion(frame[:3, :3]).tolist()}
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from hal.errors import CommandError, DeviceNotFound
+from hal.errors import CommandError, DeviceNotFound, suggest
 from hal.kinematics.urdf import TURNING
 from hal.specs import BodySpec, RobotSpec
 from hal.world import BodyJoint
 
 from .engine import SimulatedBody
-from .values import nearest, numbers
+from .values import numbers
 
 TOLERANCE = 1e-6
 """How far a position may be outside of its joint's range, rad or m."""
@@ -44,7 +44,7 @@ def joints_to_place(body: SimulatedBody, positions: Mapping[str, float]) -> dict
     placed: dict[int, float] = {}
     for name, given in positions.items():
         if name not in joints:
-            message = f"{body.name!r} has no joint {name!r} that moves{nearest(name, joints)}"
+            message = f"{body.name!r} has no joint {name!r} that moves{suggest(name, joints)}"
             raise DeviceNotFound(message, code="unknown_joint")
         (value,), joint = numbers(f"the position of {name!r}", [given]), joints[name]
         if joint.follows is not None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hal.errors import CommandError
@@ -108,18 +107,10 @@ def like(state: Any, own: Any) -> bool:
     return state is None or (isinstance(state, (int, float)) and math.isfinite(state))
 
 
-def nearest(name: str, names: Iterable[str]) -> str:
-    """Return the end of an error message: the closest known name, and all known names."""
-    known = list(names)
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else "."
-    return f"{hint} There are: {', '.join(known)}" if known else "; there is none"
-
-
-def listed(names: Sequence[str], most: int = 3) -> str:
-    """Return names for a message: the first ones, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names) if more <= 0 else f"{', '.join(names[:most])} and {more} more"
+def listed(names: Sequence[str]) -> str:
+    """Return names for a message: the first three, and how many more there are."""
+    more = len(names) - 3
+    return ", ".join(names) if more <= 0 else f"{', '.join(names[:3])} and {more} more"
 
 
 # --- dynamics --------------------------------------------------------------------------------------------------------

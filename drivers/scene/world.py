@@ -13,7 +13,7 @@ from itertools import combinations
 from operator import gt
 from typing import Any
 
-from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupported, Problem
+from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupported, Problem, suggest
 from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
 
@@ -27,7 +27,6 @@ from .values import (
     completed_dynamics,
     dynamics_values,
     like,
-    nearest,
     numbers,
     pose_json,
     same_value,
@@ -110,10 +109,10 @@ class SimulatedWorld(SceneEngine[B]):
                 continue
             key = f"objects.{spec.name}.attached"
             if spec.robot not in arms:
-                text = f"no arm {spec.robot!r}{nearest(spec.robot, arms)}"
+                text = f"no arm {spec.robot!r}{suggest(spec.robot, arms)}"
                 problems.append(Problem("objects", f"{key}.robot", text, "unknown_device"))
             elif spec.link is not None and spec.link not in (links := self.bodies[spec.robot].links):
-                text = f"robot {spec.robot!r} has no link {spec.link!r}{nearest(spec.link, links)}"
+                text = f"robot {spec.robot!r} has no link {spec.link!r}{suggest(spec.link, links)}"
                 problems.append(Problem("objects", f"{key}.link", text, "unknown_link"))
         return problems
 
@@ -498,7 +497,7 @@ class SimulatedWorld(SceneEngine[B]):
         """Return the body of that name; raises DeviceNotFound, which lists all."""
         body = self.bodies.get(name)
         if body is None:
-            raise DeviceNotFound(f"the world has no body {name!r}{nearest(name, self.bodies)}", code="unknown_body")
+            raise DeviceNotFound(f"the world has no body {name!r}{suggest(name, self.bodies)}", code="unknown_body")
         return body
 
     def link(self, body: B, name: str | None) -> int:
@@ -506,7 +505,7 @@ class SimulatedWorld(SceneEngine[B]):
         if name is None:
             return next(iter(body.links.values()))
         if name not in body.links:
-            raise DeviceNotFound(f"{body.name!r} has no link {name!r}{nearest(name, body.links)}", code="unknown_link")
+            raise DeviceNotFound(f"{body.name!r} has no link {name!r}{suggest(name, body.links)}", code="unknown_link")
         return body.links[name]
 
     def on_reset(self, name: str, callback: Callable[[], None]) -> None:

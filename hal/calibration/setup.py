@@ -14,10 +14,10 @@ import yaml
 
 from ..config import load
 from ..config.data_files import data_folder
-from ..config.files import parse_yaml, suggest
+from ..config.files import parse_yaml
 from ..config.rigfile import RigFile
 from ..config.schema import PoseConfig
-from ..errors import CommandError
+from ..errors import CommandError, suggest
 from ..geometry import Pose
 from ..kinematics.urdf import read_urdf
 from ..specs import Plan, RobotSpec

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from .. import registry
-from ..errors import HalError
+from ..errors import HalError, suggest
 from ..geometry import Pose
 from ..kinematics.composition import FLANGE, MountedTool, compose_urdf
 from ..kinematics.hulls import FORMATS
@@ -23,7 +23,7 @@ from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
 from ..specs import CameraSpec, PadSpec, RobotSpec
 from .data_files import user_path
-from .files import Problems, find_file, leave_holes, read_yaml, suggest, validate
+from .files import Problems, find_file, leave_holes, read_yaml, validate
 from .models import CameraModel, FileSource, GripperFile, GripperModel, RobotModel, TcpModel
 from .rigfile import CameraConfig, Device, GripperConfig, LeaderConfig, PadConfig, RigFile, RobotConfig
 from .schema import Unknown

@@ -15,9 +15,8 @@ codes of their own.
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -25,7 +24,7 @@ from typing import Annotated, Any, TypeVar
 import yaml
 from pydantic import AfterValidator, BaseModel, TypeAdapter, ValidationError
 
-from ..errors import ConfigError, Problem
+from ..errors import ConfigError, Problem, find_closest, suggest
 from ..specs import CameraSpec, GripperSpec, RobotSpec
 from .data_files import data_folder, is_path, list_data, user_path
 from .schema import Strict, ValueProblem, describe, find_kind, find_record, list_keys
@@ -56,19 +55,6 @@ class Problems:
         """Raise a ConfigError with all of them, if there are any."""
         if self.found:
             raise ConfigError(self.found)
-
-
-def find_closest(word: str, choices: Iterable[str]) -> str | None:
-    """Return the one of ``choices`` that ``word`` probably means; None if none is near."""
-    return next(iter(difflib.get_close_matches(word, sorted(choices), n=1)), None)
-
-
-def suggest(word: str, choices: Iterable[str]) -> str:
-    """Return ``"; did you mean ...? available: ..."`` for a name that is not among ``choices``."""
-    known = sorted(choices)
-    close = find_closest(word, known)
-    hint = f"; did you mean {close!r}?" if close else ";"
-    return f"{hint} available: {', '.join(known)}" if known else "; none are available"
 
 
 def one_of(kind: str, names: Collection[str]) -> AfterValidator:

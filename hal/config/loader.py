@@ -13,9 +13,10 @@ from typing import Any
 from pydantic import PrivateAttr
 
 from .. import registry
+from ..errors import suggest
 from ..specs import Plan
 from .context import Context
-from .files import Problems, apply_overrides, find_file, read_yaml, suggest, validate
+from .files import Problems, apply_overrides, find_file, read_yaml, validate
 from .resolve import resolve
 from .rigfile import RigFile
 

@@ -11,10 +11,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, model_validator
 
+from ..errors import suggest
 from ..kinematics.urdf import UrdfModel
 from ..specs import BodySpec, RangesSpec, Vector3
 from .context import Context, find_mesh, load_urdf
-from .files import Problems, find_file, read_yaml, suggest, validate
+from .files import Problems, find_file, read_yaml, validate
 from .models import FileSource
 from .schema import (
     ENDS,

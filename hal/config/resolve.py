@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from .. import registry
-from ..errors import ConfigError
+from ..errors import ConfigError, suggest
 from ..geometry import Pose
 from ..kinematics.collisions import in_one_place
 from ..kinematics.urdf import read_urdf
@@ -23,7 +23,7 @@ from ..pads.model import pad_model
 from ..specs import BodySpec, BoxSpec, CameraSpec, CollisionSpec, PadSpec, Plan, RandomizeSpec, RobotSpec, WorldSpec
 from .context import Context, ServedConfig
 from .data_files import user_path
-from .files import find_file, read_yaml, suggest
+from .files import find_file, read_yaml
 from .models import load_pad_models
 from .objects import load_objects
 from .resolve_cameras import resolve_camera

@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..errors import suggest
 from ..geometry import Pose
 from ..images import Intrinsics, centre_crop, from_field_of_view
 from ..specs import CameraSpec, DepthSensorSpec, SensorSpec, ViewSpec
 from ..types import STREAMS
 from .context import Context, check_camera_spec, merge_options
-from .files import suggest
 from .models import CameraModel, Capture
 from .rigfile import CameraConfig, Output, Stream, StreamConfig, make_view
 from .schema import Unknown

@@ -6,9 +6,10 @@ from contextlib import suppress
 from dataclasses import replace
 
 from .. import registry
+from ..errors import suggest
 from ..specs import Floats, KinematicsSpec, LeaderSpec, PadSpec
 from .context import Context, is_emulated
-from .files import find_file, read_yaml, suggest, validate
+from .files import find_file, read_yaml, validate
 from .models import LeaderModel
 from .resolve_robots import resolve_robot
 from .rigfile import LeaderConfig, RobotConfig

@@ -8,12 +8,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from ..errors import suggest
 from ..kinematics.urdf import read_urdf
 from ..randomization import COUNT, DISTRACTORS, TEXTURES
 from ..specs import BodySpec, CameraSpec, RandomizeSpec, RobotSpec, VariationSpec
 from .context import Context
 from .data_files import is_path, user_path
-from .files import suggest
 from .objects import load_objects
 from .randomize import EVERY, BodyVariation, LightVariation, RandomizeConfig
 from .schema import Strict, Unknown

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import registry
+from ..errors import suggest
 from ..kinematics.composition import divide_urdf
 from ..kinematics.urdf import TURNING, UrdfJoint, UrdfModel, read_urdf
 from ..specs import (
@@ -26,7 +27,7 @@ from ..specs import (
     WorkspaceSpec,
 )
 from .context import Context, check_robot_spec, is_emulated, load_arm, merge_options
-from .files import Problems, suggest
+from .files import Problems
 from .models import UNITS, LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig, WorkspaceConfig
 from .schema import Quantity, Unknown

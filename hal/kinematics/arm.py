@@ -6,7 +6,6 @@ zero. Continuous joints are treated as revolute joints without an end, so that a
 
 from __future__ import annotations
 
-import difflib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from math import cos, dist, hypot, inf, sin, sqrt
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arguments import vector
-from ..errors import CommandError, DeviceNotFound
+from ..errors import CommandError, DeviceNotFound, suggest
 from ..geometry import Pose, difference
 from . import ik
 from .urdf import parse_xml
@@ -326,8 +325,7 @@ class Kinematics:
         frame = int(self._model.getFrameId(link, self._pin.FrameType.BODY))  # a joint may have the same name
         if frame >= self._model.nframes:
             links = [f.name for f in self._model.frames if f.type == self._pin.FrameType.BODY]
-            near = difflib.get_close_matches(link, links, 3) or links
-            text = f"no link {link!r} in {Path(self.spec.urdf).name}; did you mean {', '.join(near)}?"
+            text = f"no link {link!r} in {Path(self.spec.urdf).name}{suggest(link, links)}"
             raise DeviceNotFound(text, code="unknown_link")
         return frame
 

@@ -443,7 +443,7 @@ def test_a_frozen_arm_has_a_stale_state(rig: hal.Rig, arm: hal.Robot) -> None:
 
 
 def test_unknown_devices_and_attributes_come_with_a_hint(rig: hal.Rig) -> None:
-    with pytest.raises(hal.DeviceNotFound, match=r"no robot 'pandas' \(did you mean 'panda'\?\); it has: panda"):
+    with pytest.raises(hal.DeviceNotFound, match=r"no robot 'pandas'; did you mean 'panda'\? available: panda"):
         rig.robots["pandas"]
     with raises_code(hal.DeviceNotFound, "no_camera"):
         rig.cameras["wirst"]

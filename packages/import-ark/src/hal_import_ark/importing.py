@@ -11,8 +11,7 @@ from typing import Any
 
 from hal.config import load
 from hal.config.data_files import list_data
-from hal.config.files import suggest
-from hal.errors import CommandError, ConfigError, Problem
+from hal.errors import CommandError, ConfigError, Problem, suggest
 
 from .arm_model import ArmModel
 from .entries import ArkOptions, ImportState

@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from hal.config.files import PlacedErrors, Problems, suggest
+from hal.config.files import PlacedErrors, Problems
 from hal.config.schema import describe, is_number
-from hal.errors import ConfigError
+from hal.errors import ConfigError, suggest
 from hal.kinematics.mesh_files import package_folder
 
 UPWARDS = 4

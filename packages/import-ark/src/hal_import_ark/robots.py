@@ -8,7 +8,7 @@ from typing import Any
 
 from hal.config import load
 from hal.config.data_files import list_data
-from hal.config.files import suggest
+from hal.errors import suggest
 from hal.geometry import Pose
 from hal.kinematics.urdf import read_urdf
 from hal.specs import GripperSpec, RobotSpec
