@@ -367,8 +367,7 @@ class DamiaoChain:
     def fault(self, *, engaged: bool) -> Fault | None:
         """Return the gravest fault of a motor, naming it; None without one.
 
-        Args:
-            engaged: Whether the motors are in use. One that is not may have lost communication: that is its rest.
+        A motor that is not ``engaged``, in use, may have lost communication: that is its rest.
         """
         mild: Fault | None = None
         for motor in self.motors:

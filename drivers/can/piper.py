@@ -287,12 +287,7 @@ class PiperArm(RobotDriver):
     # Switching on
 
     def engage(self) -> None:
-        """Switch the motors on, then take over control with the measured position as target. One step per call.
-
-        Raises:
-            RobotFault: The arm reports an error, or a motor does not switch on; the message names the joint.
-            ConnectionLost: The arm does not answer.
-        """
+        """Switch the motors on, then take over control with the measured position as target. One step per call."""
         if self.engaged:
             return
         self._link.send(())
@@ -331,9 +326,7 @@ class PiperArm(RobotDriver):
     def recover(self) -> None:
         """Clear the errors of the joints. It never sends the vendor's reset, which cuts the power of the motors.
 
-        Raises:
-            RobotFault: An error stays; the remedy says how to end it.
-            ConnectionLost: The arm does not answer.
+        Raises RobotFault if an error stays; the remedy says how to end it.
         """
         self._link.send([JointRequest().frame()])
 

@@ -234,12 +234,7 @@ class ServoArm(RobotDriver):
     # Switching on.
 
     def engage(self) -> None:
-        """Give the motors their present positions as goals, then switch their torque on. One step per call.
-
-        Raises:
-            RobotFault: A motor reports an error, is too far outside of its range, or does not switch on.
-            ConnectionLost: A motor does not answer.
-        """
+        """Give the motors their present positions as goals, then switch their torque on. One step per call."""
         self.chain.check()
         states = self._states
         if self.engaged or not states:
@@ -303,9 +298,7 @@ class ServoArm(RobotDriver):
     def recover(self) -> None:
         """End an overload, whose motor keeps its torque and its place, and forget a fault that is over.
 
-        Raises:
-            RobotFault: An error stays.
-            ConnectionLost: A motor does not answer.
+        Raises RobotFault if an error stays.
         """
 
         def wait() -> list[MotorState]:

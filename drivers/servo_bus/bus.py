@@ -80,12 +80,7 @@ class ServoBus:
 
     @classmethod
     def acquire(cls, port: str, protocol: ServoProtocol, baud: int | None = None) -> ServoBus:
-        """Return the process's bus at a port, and open it if it is not open yet.
-
-        Args:
-            port: Its serial device.
-            protocol: Of its motors.
-            baud: Bit/s; None for the protocol's usual one.
+        """Return the process's bus at a port, and open it if it is not open yet; ``baud`` is in bit/s.
 
         Raises:
             ConnectionLost: It cannot be opened; the message says what to do.
@@ -178,16 +173,7 @@ class ServoBus:
     ) -> dict[int, Answer]:
         """Send a frame, and return the answers of the motors that are wanted, as far as they come in time.
 
-        Args:
-            id: Of the motor, or :data:`ALL`.
-            instruction: For example :data:`READ`.
-            data: Of the frame.
-            wanted: Ids of the motors that answer.
-            limit: Longest time to wait, s.
-            linger: Time to wait for further answers once all have come, s.
-
-        Raises:
-            ConnectionLost: The port does not work.
+        That is ``limit``, s, and ``linger``, s, for further answers once all have come. Raises ConnectionLost.
         """
         self._drain()
         self.send(id, instruction, data)
@@ -288,11 +274,7 @@ class ServoBus:
         return sorted({*urgent, *(self.ids[k % len(self.ids)] for k in (self._turn, self._turn + 1))})
 
     def read_all(self, block: Block, ids: Collection[int], end: float) -> dict[int, Answer]:
-        """Return the answers of motors with these registers, as far as they come until ``end``, s, asked at once.
-
-        Raises:
-            ConnectionLost: The port does not work.
-        """
+        """Ask motors for registers at once; return the answers that come until ``end``, s. Raises ConnectionLost."""
         address, size = block
         asked = self.protocol.place(address, size) + bytes(ids)
         found = self.ask(ALL, SYNC_READ, asked, ids, end - monotonic())

@@ -324,10 +324,7 @@ class Chain:
         return Fault("out_of_range", "; ".join(found), "move it inside by hand, or calibrate it: hal calibrate arm")
 
     def clear(self, wait: Callable[[], Sequence[MotorState]]) -> None:
-        """End the errors that a motor keeps, and check that nothing else is wrong.
-
-        Args:
-            wait: Returns the states one cycle later.
+        """End the errors that a motor keeps; ``wait`` returns the states one cycle later.
 
         Raises:
             RobotFault: An error stays.

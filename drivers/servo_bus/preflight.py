@@ -31,15 +31,7 @@ _OFF = 0.1
 
 
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
-    """Check one arm, and its gripper on the same bus.
-
-    Args:
-        spec: The arm in the rig.
-        duration: Time for measuring its answers, s.
-
-    Yields:
-        One result per check.
-    """
+    """Check one arm, and its gripper on the same bus; measure the answers for ``duration`` s."""
     arm: ServoArm = registry.load(spec.driver, "robot")(spec)
     devices: list[ServoArm | ServoGripper] = [arm]
     if spec.gripper is not None and spec.gripper.driver == spec.driver:

@@ -162,13 +162,9 @@ class ServoProtocol(ABC):
 
     @abstractmethod
     def prepare(self, ids: Sequence[int], goals: Sequence[int], limits: Sequence[int], watch: bool) -> Writes:
-        """Return what gives motors their goals and limits, and takes away their profiles.
+        """Return what gives each motor its goal, counts, and its torque limit, and takes away its profile.
 
-        Args:
-            ids: The motors.
-            goals: For each, counts.
-            limits: For each, torque limits.
-            watch: Whether they shall stop when they hear nothing for a while, where they can.
+        With ``watch`` they shall stop when they hear nothing for a while, where they can.
         """
 
     @abstractmethod

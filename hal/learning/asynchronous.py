@@ -380,14 +380,8 @@ class RemotePolicy:
         """Return ``new`` at the times of the old chunk, which changes into it over the steps of ``blend``.
 
         Both have a target every step, but not at the same times: one that is due shortly after another of the other
-        chunk would turn the noise of a policy into jerk.
-
-        Args:
-            old: The present chunk.
-            t: Times of all targets of the answer (k,), s.
-            decoded: These targets.
-            new: Those of them that are ahead.
-            now: Time, s.
+        chunk would turn the noise of a policy into jerk. ``t`` (k,), s, and ``decoded`` are all targets of the answer,
+        of which ``new`` has those that are ahead.
         """
         begin, end = (int(np.ceil((x - old.t[0]) / self._dt)) for x in (now + _ONSET, new.t[-1]))
         grid: Array = (old.t[0] + self._dt * np.arange(begin, max(begin, end) + 1))[:CHUNK_POINTS]

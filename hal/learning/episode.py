@@ -166,11 +166,7 @@ def _arrange(movers: Sequence[_RandomBody], random: np.random.Generator, still: 
 def _make_random_body(world: World, body: BodySpec, ranges: RangesSpec, home: _Solids | None) -> _RandomBody:
     """Return an object with what its poses depend on.
 
-    Args:
-        world: The simulated world.
-        body: The object.
-        ranges: Its random ranges.
-        home: Bodies that stand where they are configured; None for an object that nothing collides with.
+    ``home`` has the bodies that stand where they are configured; None for an object that nothing collides with.
     """
     if home is None:
         return _RandomBody(body.name, body.orientation, ranges, None, {})

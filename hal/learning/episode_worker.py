@@ -295,16 +295,7 @@ def clean_part(folder: str | Path, recipe: dict[str, Any]) -> dict[int, bool | N
 
 
 def check_recipe(place: str, made: Any, recipe: dict[str, Any]) -> None:
-    """Check that episodes were generated with a recipe.
-
-    Args:
-        place: Where they are.
-        made: Fields of the recipe that they were generated with, or None.
-        recipe: Fields of the other one.
-
-    Raises:
-        CommandError: They were not (code ``other_recipe``).
-    """
+    """Raise CommandError (code ``other_recipe``) if the episodes at a place were ``made`` with another recipe."""
     if made != recipe:
         raise CommandError(f"{place} {_difference(made, recipe)}; choose another place", code="other_recipe")
 

@@ -59,11 +59,7 @@ class Policy(Protocol):
 
 
 def load_object(place: str, what: str) -> Any:
-    """Return the callable at ``module:name``.
-
-    Args:
-        place: ``module:name``; the name may have dots.
-        what: What it is, for the message of an error.
+    """Return the callable at ``module:name``, whose name may have dots; ``what`` it is, for the message of an error.
 
     Raises:
         CommandError: It cannot be imported (code ``not_importable``) or called (``not_callable``).
@@ -93,10 +89,7 @@ def is_made_with_rig(target: Any) -> bool:
 def load_policy(place: str, rig: Rig) -> Policy:
     """Return the policy at ``module:name``.
 
-    A class is instantiated, with the rig if its constructor takes an argument.
-
-    Raises:
-        CommandError: It cannot be imported (code ``not_importable``) or called (``not_callable``).
+    A class is instantiated, with the rig if its constructor takes an argument. Raises as :func:`load_object`.
     """
     target: Any = load_object(place, "policy")
     if isinstance(target, type):

@@ -30,11 +30,7 @@ ObservationDict = dict[str, NDArray[Any]]
 def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, speeds: tuple[float, float]) -> spaces.Box:
     """Return the box of actions: the numbers of each arm, one arm after the other.
 
-    Args:
-        robots: The arms.
-        kind: Kind of action.
-        rate_hz: Steps per second.
-        speeds: Greatest speeds of the tcp, m/s and rad/s.
+    ``speeds`` are the greatest of the tcp, m/s and rad/s.
 
     Raises:
         NotSupported: Torques, for an arm that has no limits for them (``no_torque_limits``).

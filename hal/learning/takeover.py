@@ -38,12 +38,7 @@ class Takeover:
         self.active, self.intervals = False, []
 
     def command(self, now: float, dt: float) -> tuple[Command, float | None] | None:
-        """Return the person's command and grip; None while the policy drives.
-
-        Args:
-            now: Time on ``rig.clock``, s.
-            dt: Time since the last turn, s.
-        """
+        """Return the person's command and grip at ``now``, ``dt`` s after the last turn; None if the policy drives."""
         state = self.pad.state()
         if self.teleop.is_touched(state):
             self._touched = now

@@ -70,10 +70,8 @@ class _Uploaded(NamedTuple):
 class UploadedEpisodes:
     """The episodes at an address, as the program sees them.
 
-    Raises:
-        DriverMissing: fsspec, or its package for this kind of address, is not installed.
-        CommandError: The address is wrong (code ``bad_address``).
-        ConnectionLost: The address cannot be used (code ``upload_failed``); so may all methods raise.
+    Raises as :func:`_open_address`, and ConnectionLost if the address cannot be used (code ``upload_failed``); so may
+    all methods.
     """
 
     def __init__(self, address: str, recipe: Mapping[str, Any]) -> None:
@@ -128,11 +126,8 @@ class UploadedEpisodes:
 class EpisodeUploader:
     """A worker's dataset in a temporary folder, and its uploads.
 
-    What workers that were killed left in the temporary folder of this computer is removed.
-
-    Raises:
-        DriverMissing: fsspec, or its package for this kind of address, is not installed.
-        CommandError: The address is wrong (code ``bad_address``).
+    What workers that were killed left in the temporary folder of this computer is removed. Raises as
+    :func:`_open_address`.
     """
 
     def __init__(self, address: str) -> None:
@@ -160,11 +155,7 @@ class EpisodeUploader:
         return self._count >= GROUP
 
     def upload(self, number: int, mark: bool | None) -> None:
-        """Upload an episode, which is the last of the dataset.
-
-        Raises:
-            ConnectionLost: It cannot be uploaded (code ``upload_failed``).
-        """
+        """Upload the last episode of the dataset. Raises ConnectionLost if it cannot be (code ``upload_failed``)."""
         files = [path for path in self.folder.rglob("*") if path.is_file() and path.name != ".lock"]
         new = {path: file_version(path) for path in files}
         mark_name = next(name for name, value in _MARKS.items() if value is mark)

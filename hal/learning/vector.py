@@ -107,13 +107,7 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
     """Worlds that step together; made by :func:`make_vec`.
 
     If a world raises an error, the others have finished that step, the error names the world, and the next ``reset``
-    starts again. If a process is killed, all end.
-
-    Args:
-        make: Makes one world; called in the processes.
-        num_envs: Number of worlds.
-        processes: Number of processes.
-        autoreset_mode: What follows the end of an episode.
+    starts again. If a process is killed, all end. ``make`` makes one world; it is called in the processes.
     """
 
     def __init__(

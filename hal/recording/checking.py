@@ -79,10 +79,8 @@ def _read_all(episode: Episode, camera: str, stream: str) -> None:
 def check_rows(episode: Episode, start: int | None, tasks: Sequence[str] | None = None) -> None:
     """Raise DatasetError if an episode's rows are not numbered as in the index, or times run backwards.
 
-    Args:
-        episode: The episode.
-        start: Number of its first row in the whole dataset; None if unknown.
-        tasks: All tasks, in the order of their numbers; None if unknown.
+    ``start`` is the number of its first row in the whole dataset, ``tasks`` are all tasks in the order of their
+    numbers; None if unknown.
     """
     columns, rows = episode.columns, np.arange(episode.length)
     file = episode.data_file

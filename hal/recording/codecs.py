@@ -302,12 +302,9 @@ def merge_stacked(stacked: Mapping[str, NDArray[Any]]) -> Stats:
 
 
 def exchange_flags(whole: Stats, old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]) -> Stats:
-    """Return the statistics of a column of 0 and 1 in which some parts have changed.
+    """Return the statistics of a column of 0 and 1, ``whole`` before some of its parts changed from ``old`` to ``new``.
 
-    Args:
-        whole: Statistics of all parts, before.
-        old: Those of some parts, stacked along a first axis; ``count`` stays.
-        new: The same parts, after the change.
+    Those of the parts are stacked along a first axis; ``count`` stays.
     """
     total, counts = whole["count"], old["count"]
     ones = np.rint(whole["mean"] * total) + np.rint(new["mean"] * counts).sum(0) - np.rint(old["mean"] * counts).sum(0)

@@ -370,15 +370,8 @@ def select_devices(
 ) -> tuple[RowSampler, list[CameraBuffer], list[str]]:
     """Return what is recorded of a rig. Without ``cameras`` all are; ``streams`` may have ``objects``, for their poses.
 
-    ``known`` are the names of the numbers in each column of the dataset that is continued.
-
-    Returns:
-        The sampler of all arms and pads, a buffer per camera, and notes for the operator.
-
-    Raises:
-        CommandError: Something cannot be recorded.
-        StaleStateError: The state of an arm is not available.
-        ConnectionLost: A device is lost.
+    That is the sampler of all arms and pads, a buffer per camera, and notes for the operator. ``known`` are the names
+    of the numbers in each column of the dataset that is continued. Raises as :class:`~hal.recording.Recorder`.
     """
     there = (*STREAMS, OBJECTS)
     if unknown := [stream for stream in streams if stream not in there]:

@@ -35,13 +35,7 @@ _STILL = 0.2
 
 
 class Hand:
-    """An arm of a task with its gripper. Poses and velocities are in the task's frame: the base of the first arm.
-
-    Args:
-        env: The task.
-        robot: The arm.
-        base: Base of the task's first arm in the world.
-    """
+    """An arm of a task with its gripper. Poses and velocities are in the task's frame: the first arm's ``base``."""
 
     def __init__(self, env: RigEnv, robot: Robot, base: Pose) -> None:
         self.robot = robot

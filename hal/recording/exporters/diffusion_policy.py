@@ -35,17 +35,9 @@ def make_group(folder: Path, attributes: dict[str, Any] | None = None) -> Path:
 
 
 class ZarrArray:
-    """An array (rows, ...) that grows row by row, and is complete when it is closed."""
+    """An array in a new folder that grows by ``rows`` rows of a shape, and is complete when it is closed."""
 
     def __init__(self, folder: Path, shape: tuple[int, ...], dtype: np.dtype[Any], rows: int) -> None:
-        """Create the array.
-
-        Args:
-            folder: Its folder, which must not exist.
-            shape: Shape of one row.
-            dtype: Type of the numbers.
-            rows: Rows that will be added; no chunk is longer.
-        """
         import zstandard
 
         folder.mkdir()
