@@ -316,15 +316,13 @@ class DrawnWorld:
 def _matrices(poses: Array) -> Array:
     """Return poses (N, 7), position and quaternion, as matrices (N, 4, 4)."""
     x, y, z, w = poses[:, 3:].T
-    matrices = np.zeros((len(poses), 4, 4))
-    rows = (
+    rotations = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
         (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
-    for k, row in enumerate(rows):
-        for column, values in enumerate(row):
-            matrices[:, k, column] = values
+    matrices = np.zeros((len(poses), 4, 4))
+    matrices[:, :3, :3] = np.moveaxis(np.array(rotations), 2, 0)
     matrices[:, :3, 3] = poses[:, :3]
     matrices[:, 3, 3] = 1
     return matrices

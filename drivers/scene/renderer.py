@@ -108,16 +108,16 @@ class _Body(NamedTuple):
 
 
 class GLRenderer(Renderer):
-    """Draws with moderngl on EGL; without a ``library``, meshes come from one with the user's cache.
+    """Draws with moderngl on EGL; meshes come from a library with the user's cache.
 
     The shader writes depth in metres, so it is as exact as a float and needs no conversion. The picture is drawn with
     its first row first, so nothing is flipped either. Raises DriverMissing if moderngl, EGL or a graphics driver is
     missing; names the command that installs it.
     """
 
-    def __init__(self, scene: DrawnWorld, library: MeshLibrary | None = None) -> None:
+    def __init__(self, scene: DrawnWorld) -> None:
         self._scene = scene
-        self._library = library or MeshLibrary()
+        self._library = MeshLibrary()
         self._lock = threading.Lock()
         self._context = create_context()
         self.description = f"OpenGL on {self._context.info['GL_RENDERER']}"

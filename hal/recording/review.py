@@ -194,7 +194,7 @@ def measure_episode(episode: Episode) -> EpisodeSummary:
     """Read every row of an episode, and count its pictures. Raises DatasetError."""
     episode.check_pictures()
     content = EpisodeContent(episode)
-    tripped = np.column_stack([_trips(content, arm) != 0 for arm in content.arms])
+    tripped = np.column_stack([_read_status(content, arm)[1] != 0 for arm in content.arms])
     jerk, idle = _measure_motion(content)
     return EpisodeSummary(
         number=episode.number,
@@ -323,13 +323,13 @@ def _photos(
 def _statuses(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
     y = _legend(canvas, content, y) + 6
     for arm in content.arms:
-        status = content.of(arm, "rig.status").astype(int)
+        status, trips, _ = _read_status(content, arm)
         canvas.text(_MARGIN, y, arm.name, 14)
-        for run in _runs(content, status[:, 0]):
+        for run in _runs(content, status):
             x, width = _span(content, run)
             canvas.box(x, y + 18, width, _STRIP, _STATUS[RobotStatus(run.value)])
         free = 0.0
-        for run in _runs(content, status[:, 1]):
+        for run in _runs(content, trips):
             if run.value:
                 x, _ = _span(content, run)
                 words = f"{Trip(run.value)} at {run.start:.2f} s"
@@ -342,13 +342,11 @@ def _statuses(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
 
 def _legend(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
     x: float = _MARGIN
-    there = {int(value) for arm in content.arms for value in content.of(arm, "rig.status")[:, 0]}
-    limited = Limited(0)
-    for arm in content.arms:
-        limited |= Limited(int(np.bitwise_or.reduce(_limits(content, arm))))
+    status, trips, limits = np.concatenate([_read_status(content, arm) for arm in content.arms], axis=1)
+    limited = Limited(int(np.bitwise_or.reduce(limits)))
     items = [(_COMMANDED, "commanded"), (_MEASURED, "measured")]
-    items += [(_STATUS[status], str(status)) for status in RobotStatus if status in there]
-    items += [(_STOPPED, "stop latched")] if any(_trips(content, arm).any() for arm in content.arms) else []
+    items += [(_STATUS[one], str(one)) for one in RobotStatus if one in status]
+    items += [(_STOPPED, "stop latched")] if trips.any() else []
     items += [(_HELD_BACK, f"held back by the servo ({limited})")] if limited else []
     items += [(_MISSING, "rows dropped")] if content.episode.info.get("gaps") else []
     for colour, words in items:
@@ -358,12 +356,10 @@ def _legend(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
     return y + 20
 
 
-def _limits(content: EpisodeContent, arm: ArmColumns) -> NDArray[np.int64]:
-    return content.of(arm, "rig.status")[:, 2].astype(np.int64)
-
-
-def _trips(content: EpisodeContent, arm: ArmColumns) -> NDArray[np.int64]:
-    return content.of(arm, "rig.status")[:, 1].astype(np.int64)
+def _read_status(content: EpisodeContent, arm: ArmColumns) -> NDArray[np.int64]:
+    """Return the status, the trip and the limits (3, rows) of an arm."""
+    columns: NDArray[np.int64] = content.of(arm, "rig.status").astype(np.int64).T
+    return columns
 
 
 def _runs(content: EpisodeContent, values: NDArray[np.int64]) -> Iterator[_Run]:
@@ -405,7 +401,8 @@ def _panels(canvas: SheetCanvas, content: EpisodeContent, curves: list[_Curve], 
 def _panel(canvas: SheetCanvas, content: EpisodeContent, curve: _Curve, left: float, top: float, width: float) -> None:
     canvas.text(left, top - 4, curve.title, 13, BLACK, "ls")
     canvas.box(left, top, width, _PANEL, (250, 250, 250))
-    for flags, colour in ((_limits(content, curve.arm), _HELD_BACK), (_trips(content, curve.arm), _STOPPED)):
+    _, trips, limits = _read_status(content, curve.arm)
+    for flags, colour in ((limits, _HELD_BACK), (trips, _STOPPED)):
         for run in _runs(content, (flags != 0).astype(np.int64)):
             if run.value:
                 x, wide = _span(content, run, left, width)

@@ -35,8 +35,9 @@ def write(job: ExportJob, path: Path) -> None:
         for k, content in enumerate(job.episodes()):
             _write_episode(job, content, data.create_group(f"demo_{k}"), h5py)
         data.attrs["total"] = sum(content.rows for content in job.contents)
-        data.attrs["env_args"] = json.dumps(_environment(job))
-        data.attrs["about"] = json.dumps(job.about())
+        about = job.about()  # there is no environment for a rig, and training needs none
+        kind = {"env_name": about["robot_type"] or "rig", "type": _GYM, "env_kwargs": {"fps": about["fps"]}}
+        data.attrs["env_args"], data.attrs["about"] = json.dumps(kind), json.dumps(about)
         for name, demos in _filters(job).items():
             file[f"mask/{name}"] = np.array([f"demo_{k}" for k in demos], dtype="S")
 
@@ -83,12 +84,6 @@ def _write_pictures(stream: PictureStream, group: Any, h5py: Any) -> None:
         view[:-1] = source[1:]
     view[stream.rows - 1 :] = source[stream.rows - 1 :]
     group["next_obs"].create_virtual_dataset(name, view)
-
-
-def _environment(job: ExportJob) -> dict[str, Any]:
-    """Return robomimic's description of an environment. There is none for a rig, and training needs none."""
-    about = job.about()
-    return {"env_name": about["robot_type"] or "rig", "type": _GYM, "env_kwargs": {"fps": about["fps"]}}
 
 
 def _filters(job: ExportJob) -> dict[str, list[int]]:
