@@ -15,7 +15,6 @@ import pytest
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
 from app_kit import CROSS, seed_of, write_pad
-from engines_kit import Engine
 from recording_kit import ROUNDED, Stage, at_row, small
 from recording_layout import check_layout, check_stamps
 
@@ -37,10 +36,9 @@ def episodes(folder: Path) -> list[Episode]:
     return list(Dataset(folder / "data").episodes)
 
 
-def test_two_demonstrations_by_one_command(engine: Engine, tmp_path: Path) -> None:
-    """The recorded pad lifts both cubes on every engine, and the datasets have the same columns."""
+def test_two_demonstrations_by_one_command(tmp_path: Path) -> None:
+    """The recorded pad lifts both cubes."""
     command = [sys.executable, str(APP), "--sim", "--out", "data", "--report", "report.json", "--pad", str(PAD)]
-    command += ["--engine", engine.name]
     command += ["--episodes", "2", "--task", "lift the cube"]
     command += [word for override in ("simulation.clock=lock_step", *SMALL) for word in ("--set", override)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
@@ -49,7 +47,6 @@ def test_two_demonstrations_by_one_command(engine: Engine, tmp_path: Path) -> No
     for text in ("Cross: start recording", "2 of 2 in this run", "2 succeeded, 0 failed, 0 discarded"):
         assert text in done.stdout
     check_report_and_columns(tmp_path)
-    assert {episode.info["engine"]["name"] for episode in episodes(tmp_path)} == {engine.name}
     starts = [check_demonstration(number, episode) for number, episode in enumerate(episodes(tmp_path))]
     assert len({tuple(start.round(2)) for start in starts}) == 2, "the cube was placed elsewhere"
     check_images(tmp_path)

@@ -580,7 +580,7 @@ def test_devices_are_closed_although_an_arm_does_not_come_to_rest() -> None:
         control = rig.robots["panda"].control()
         control.__enter__()
         loop = Loop(rig, control, TURN)
-        assert loop.drive(20.0) is None
+        assert loop.drive(12.0) is None
         with pytest.raises(hal.ConnectionLost):  # the session waits as long
             control.close()
         assert loop.moves

@@ -32,8 +32,10 @@ def watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
         app.close()
 
 
-@pytest.mark.parametrize("command", [MOTION, TORQUE], ids=["motion", "torque"])
-@pytest.mark.parametrize("how", ["kill -9", "SIGTERM", "Ctrl-C", "closed terminal"])
+@pytest.mark.parametrize(
+    ("how", "command"),
+    [("kill -9", MOTION), ("SIGTERM", MOTION), ("Ctrl-C", MOTION), ("closed terminal", MOTION), ("kill -9", TORQUE)],
+)
 def test_an_app_that_ends(watch, how: str, command: str) -> None:
     app = watch(command=command)
     assert app.speed() > 0.1, "the arm moves before"

@@ -46,7 +46,7 @@ def run(arguments: list[str], program: str | None, folder: Path) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("how", ["unguarded script", "standard input", "interactive prompt", "thread"])
+@pytest.mark.parametrize("how", ["unguarded script", "standard input", "thread"])
 def test_a_program(tmp_path: Path, how: str) -> None:
     """Without a main guard, and where nothing closes the rig."""
     body = "\n    ".join(WITH.strip().splitlines())
@@ -56,7 +56,6 @@ def test_a_program(tmp_path: Path, how: str) -> None:
     arguments, program = {
         "unguarded script": ([str(script)], None),
         "standard input": (["-"], BODY),
-        "interactive prompt": (["-i", "-q"], BODY),
         "thread": (["-c", threaded], None),
     }[how]
     expect(run(arguments, program, tmp_path))
@@ -148,8 +147,6 @@ DRIVER = DriverSpec(name="lab", robot="lab_arm:Arm")
     ("where", "end", "says"),
     [
         ("import", "os.kill(os.getpid(), 2)", "SIGINT"),
-        ("open", "os.kill(os.getpid(), 2)", "SIGINT"),
-        ("open", "os.kill(os.getpid(), 15)", "SIGTERM"),
         ("open", "os.kill(os.getpid(), 9)", "SIGKILL"),
         ("open", "os._exit(3)", "status 3"),
     ],

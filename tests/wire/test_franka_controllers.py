@@ -50,7 +50,7 @@ def test_an_arm_rests_at_its_set_point(emulator: Emulator, robot: str, controlle
 def test_every_session_starts_on_an_arm_that_has_not_settled(fr3: Emulator) -> None:
     with rig_of(fr3.host, "fr3", lock_step=True) as rig:
         arm = arm_of(rig)
-        for seed in range(20):
+        for seed in range(8):
             fr3.control.send(f"unrest {seed}")
             rig.clock.sleep(0.01)
             with arm.control(rate_hz=50, unattended=True, controller=CONTROLLERS[seed % 2]) as control:

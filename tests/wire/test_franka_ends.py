@@ -54,6 +54,10 @@ def emulator(request: pytest.FixtureRequest) -> Iterator[Emulator]:
         yield started
 
 
+one = pytest.mark.parametrize("emulator", ["fr3"], indirect=True)
+"""For what does not depend on the vendor's library."""
+
+
 def runs(pid: int) -> bool:
     """Whether a process exists and is no zombie."""
     try:
@@ -104,7 +108,11 @@ def app(emulator: Emulator) -> Iterator[App]:
     started.close()
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize(
+    ("emulator", "how"),
+    [("fr3", signal.SIGKILL), ("panda", signal.SIGKILL), ("fr3", signal.SIGINT)],
+    indirect=["emulator"],
+)
 def test_an_app_that_ends_leaves_an_arm_at_rest(emulator: Emulator, app: App, how: signal.Signals) -> None:
     assert max(map(abs, emulator.control.send("state")["dq"])) > 0.1, "it moves"
     app.process.send_signal(how)
@@ -115,6 +123,7 @@ def test_an_app_that_ends_leaves_an_arm_at_rest(emulator: Emulator, app: App, ho
     assert not emulator.events("reflex")
 
 
+@one
 def test_an_app_that_is_stopped_leaves_an_arm_at_rest(emulator: Emulator, app: App) -> None:
     app.process.send_signal(signal.SIGSTOP)
     wait_until(lambda: max(map(abs, emulator.control.send("state")["dq"])) < 1e-9, "at rest")
@@ -122,6 +131,7 @@ def test_an_app_that_is_stopped_leaves_an_arm_at_rest(emulator: Emulator, app: A
     assert emulator.control.send("state")["mode"] == "move", "it holds, and the session may continue"
 
 
+@one
 def test_the_arms_own_process_is_killed(emulator: Emulator, app: App) -> None:
     """Then no program can end the motion in order: the robot does, and the app gets an error."""
     os.kill(app.children[0], signal.SIGKILL)
@@ -167,6 +177,7 @@ def test_another_version_is_named(emulator: Emulator) -> None:
     assert opening_error(emulator.host, model_of(emulator)).code == "version"
 
 
+@one
 def test_the_error_of_a_second_program_names_the_first_one(emulator: Emulator, app: App) -> None:
     error = opening_error(emulator.host, model_of(emulator))
     assert isinstance(error, hal.ControlTaken)
@@ -205,6 +216,7 @@ def test_settings_reach_the_robot(emulator: Emulator) -> None:
     assert "0.5" in json.dumps(settings)
 
 
+@one
 def test_an_arm_is_ready_while_another_thread_works(emulator: Emulator) -> None:
     """A busy thread in the app has nothing to do with the arm's process: no motion is lost."""
     done = threading.Event()

@@ -52,6 +52,12 @@ class Lab:
             if wanted(line):
                 return line
 
+    @property
+    def children(self) -> list[Path]:
+        """Its emulators' processes, until it has ended."""
+        found = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return [Path("/proc", number) for number in found.read_text().split()] if self.process.poll() is None else []
+
     def type(self, line: str) -> None:
         """Type a line at the prompt."""
         self.process.stdin.write(line + "\n")
@@ -77,6 +83,12 @@ def config(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     return path
 
 
+def check_ended(lab: Lab, children: list[Path]) -> None:
+    """Check that it ends, and that its emulators end with it."""
+    lab.process.wait(15.0)
+    wait_until(lambda: not any(child.exists() for child in children), "emulators ended", timeout=15.0)
+
+
 @pytest.fixture
 def lab(config: Path) -> Iterator[Lab]:
     """The laboratory, ready."""
@@ -87,8 +99,9 @@ def lab(config: Path) -> Iterator[Lab]:
             missing.discard(lab.wait_line(lambda line: "ready:" in line).partition(":")[0])
         yield lab
     finally:
+        children = lab.children
         lab.process.kill()
-        lab.process.wait(10.0)
+        check_ended(lab, children)
 
 
 def grasp_cube(config: Path, sim: bool) -> tuple[bool, float, float]:
@@ -130,17 +143,13 @@ def test_one_program_grasps_in_simulation_and_in_the_laboratory_and_a_typed_faul
 
 
 @pytest.mark.parametrize("config", ["yam"], indirect=True)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_no_emulator_outlives_it(lab: Lab, config: Path, number: int) -> None:
-    children = Path(f"/proc/{lab.process.pid}/task/{lab.process.pid}/children").read_text().split()
+def test_no_emulator_outlives_it(lab: Lab, config: Path) -> None:
+    """Nor when it is killed, as every other test here does at its end."""
+    children = lab.children
     assert len(children) == 3
     for _ in range(3):  # as impatient people do
-        lab.process.send_signal(number)
-    lab.process.wait(15.0)
-    limit = time.monotonic() + 15.0
-    while any(Path(f"/proc/{child}").exists() for child in children) and time.monotonic() < limit:
-        time.sleep(0.02)
-    assert not any(Path(f"/proc/{child}").exists() for child in children)
+        lab.process.send_signal(signal.SIGINT)
+    check_ended(lab, children)
 
 
 def test_it_names_a_model_that_has_no_emulator_and_knows_the_address_of_localhost(tmp_path: Path) -> None:

@@ -69,11 +69,9 @@ def test_two_leaders_drive_two_arms_and_the_recording_is_replayed(
     (episode,) = Dataset("data").episodes
     moved = dict(zip(episode.names("action"), np.ptp(episode.columns["action"], axis=0), strict=True))
     assert min(moved["small.shoulder_lift"], moved["large.panda_joint1"]) > 0.05, moved
-    for robot in ("small", "large"):
-        options = ["--robot", robot, "--unattended", "--report", "played.json"]
-        played = run_here(replay.main, "data", *rig, *options)
-        assert played.returncode == 0, played.stdout + played.stderr
-        assert json.loads(Path("played.json").read_text())["deviation"]["tcp_mm"]["max"] < 2.0, played.stdout
+    played = run_here(replay.main, "data", *rig, "--robot", "large", "--unattended", "--report", "played.json")
+    assert played.returncode == 0, played.stdout + played.stderr
+    assert json.loads(Path("played.json").read_text())["deviation"]["tcp_mm"]["max"] < 2.0, played.stdout
 
 
 def test_a_gello_drives_an_emulated_fr3_and_the_recording_is_replayed(

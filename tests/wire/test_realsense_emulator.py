@@ -201,7 +201,7 @@ def run(program: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=60)
 
 
-@pytest.mark.parametrize("end", ["pass", "raise SystemExit(0)", "camera.unplug()", "camera.close()", "del camera"])
+@pytest.mark.parametrize("end", ["pass", "del camera"])
 def test_a_program_may_end_while_it_streams(end: str) -> None:
     done = run(
         f"""

@@ -58,6 +58,7 @@ def tour(rig: hal.Rig, poses: Sequence[list[float]]) -> list[hal.RobotState]:
     return found
 
 
+@pytest.mark.parametrize("emulator", POSES if SOAK else ["so101"], indirect=True)
 @pytest.mark.parametrize("run", range(10 if SOAK else 1))
 def test_the_tour_ends_at_the_poses_of_the_simulation_and_the_arm_holds_afterwards(
     emulator: ServoBusProcess, run: int
@@ -92,7 +93,7 @@ def answers(arm: hal.Robot) -> bool:
 
 @pytest.mark.parametrize(
     ("emulator", "command"),
-    [("so101", one) for one in ("unplug on", "power on", "silent 2 on", "error 3 32", "lose 1", "late 0.2")]
+    [("so101", one) for one in ("unplug on", "power on", "error 3 32", "late 0.2")]
     + [("viperx", one) for one in ("power on", "error 3 32")],  # what each protocol says in its own way
     indirect=["emulator"],
 )

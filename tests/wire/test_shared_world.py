@@ -78,12 +78,6 @@ def fr3() -> Iterator[Bench]:
         yield Bench("franka_emulator", sets)
 
 
-@pytest.fixture(params=["yam_emulator", "piper_emulator"])
-def can(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    with EmulatorProcess(request.param, *SCENE) as emulator:
-        yield Bench(request.param, emulator.overrides)
-
-
 def height_of_cube(frame: hal.Frame) -> float:
     """Return the height in the world of the pink points that a frame shows, m."""
     red, green, blue = (frame.color[..., k].astype(int) for k in range(3))
@@ -122,7 +116,7 @@ def lose(rig: hal.Rig) -> None:
     wait_until(lambda: not gripper.state().grasped and gripper.state().width < 0.005, "the fingers closed")
 
 
-def test_a_hand_holds_what_the_camera_sees_lifted_and_loses_and_misses(fr3: Bench) -> None:
+def test_a_hand_holds_what_the_camera_sees_lifted_and_loses_it(fr3: Bench) -> None:
     with fr3.open() as rig:
         arm, camera = rig.robots["arm"], rig.cameras["scene"]
         pose = prepare(rig)
@@ -134,13 +128,13 @@ def test_a_hand_holds_what_the_camera_sees_lifted_and_loses_and_misses(fr3: Benc
         high = height_of_cube(camera.read(after=rig.clock.now()))
         assert high - low == pytest.approx(OPTIONS["lift"], abs=0.01), "the camera sees it lifted"
         lose(rig)
-        pose = prepare(rig)
-        rig.world.reset("cube", pose=FAR)
-        assert grasp(arm, pose, width=0.03, **OPTIONS).reason == "missed"
 
 
-def test_fingers_on_a_bus_hold_and_lose(can: Bench) -> None:
-    with can.open() as rig:
+def test_fingers_on_a_bus_hold_and_lose() -> None:
+    with (
+        EmulatorProcess("piper_emulator", *SCENE) as emulator,
+        Bench("piper_emulator", emulator.overrides).open() as rig,
+    ):
         arm = rig.robots["arm"]
         done = grasp(arm, prepare(rig), width=0.03, hold=0.3, **OPTIONS)
         assert done, done.message

@@ -155,10 +155,9 @@ def test_a_lost_state_now_and_then_stops_nothing(emulator: UrEmulator) -> None:
         assert emulator.status()["lost"] > 20
 
 
-@pytest.mark.parametrize("robot", ["ur5", "ur20"])
-def test_other_arms_are_driven_by_their_models(robot: str) -> None:
-    """The first is a CB3, with 125 Hz and without remote control."""
-    emulator = UrEmulator(robot=robot)
+def test_another_arm_is_driven_by_its_model() -> None:
+    """A CB3, with 125 Hz and without remote control."""
+    emulator = UrEmulator(robot="ur5")
     try:
         with hal.open(emulator.rig()) as opened:
             arm = opened.robots["arm"]

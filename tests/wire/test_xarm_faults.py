@@ -20,13 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.pair]
 NAMED_WITHIN = 0.150
 FAULTS = {
     "C31": ("error 31", ""),
-    "C24": ("error 24", ""),
     "C24 after a jump": ("jump 0.3", ""),
-    "C22": ("error 22", ""),
-    "C60": ("error 60", ""),
-    "C2": ("error 2", ""),
-    "C35": ("error 35", ""),
-    "C12": ("error 12", ""),
     "C77 that nobody knows": ("error 77", ""),
     "C1": ("estop on", "estop off"),
     "STOPPED": ("state 4", ""),
@@ -165,18 +159,17 @@ def test_a_pressed_emergency_stop_cannot_be_cleared(rig: hal.Rig, emulator: XArm
     recover(rig, arm)
 
 
-@pytest.mark.parametrize(("command", "code"), [("mode 2", "MANUAL_MODE"), ("state 3", "PAUSED")])
-def test_an_arm_that_somebody_else_has_opens_no_session(command: str, code: str) -> None:
+def test_an_arm_that_is_led_by_hand_opens_no_session() -> None:
     other = XArmEmulator()
     try:
         other.control.send("power on")
         with hal.open(other.rig()) as rig:
-            other.control.send(command)
+            other.control.send("mode 2")
             time.sleep(0.05)
             with pytest.raises(hal.RobotFault) as refused:
                 rig.robots["arm"].move_to(rig.robots["arm"].home, unattended=True)
-            assert refused.value.code == code
-            assert other.status()["mode"] == (2 if command == "mode 2" else 0)
+            assert refused.value.code == "MANUAL_MODE"
+            assert other.status()["mode"] == 2
     finally:
         other.close()
 
