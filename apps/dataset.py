@@ -192,7 +192,8 @@ def _list(dataset: Dataset, args: argparse.Namespace) -> None:
     for episode in found:
         dropped = episode.info["dropped"] or 0
         end = f"{NAMES[episode.success]:8}  {dropped:7d}  {episode.task}"
-        print(f"{episode.number:7d}  {episode.length / episode.fps:7.2f}  {end}")
+        trouble = f"  [{episode.trouble}]" if episode.trouble else ""
+        print(f"{episode.number:7d}  {episode.length / episode.fps:7.2f}  {end}{trouble}")
     print(f"{len(found)} of {count_episodes(len(dataset))} of {dataset.root}")
     for note in dataset.notes:
         print(f"note: {note}")

@@ -107,6 +107,8 @@ def _describe_replay(robot: Robot, episode: Episode) -> Iterator[str]:
     from hal.recording.layout import GRIP_FORCE
 
     yield f"replays  {robot.name}"
+    if episode.trouble:
+        yield f"ended    the recording ended by itself: {episode.trouble}"
     try:
         episode.check_pictures()
     except DatasetError as error:

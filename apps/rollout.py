@@ -351,8 +351,7 @@ class RolloutRun:
             outcome = self.runner.run(seed, lambda seconds: self._show(number, seconds))
         finally:
             if self.recorder is not None:
-                is_whole = self.recorder.status().state == "recording"  # not ended by itself, before the policy
-                mark = outcome.success if outcome is not None and is_whole else None
+                mark = outcome.success if outcome is not None else None
                 self.recorder.save(mark, wait=True, result=self._result(outcome))
         self._noted = ""
         self._note_driver("")

@@ -197,6 +197,11 @@ class Episode:
         return None if mark is None else bool(mark)
 
     @property
+    def trouble(self) -> str:
+        """Why its recording ended by itself, such as a lost camera; empty if it was saved."""
+        return str(self.info.get("trouble") or ("recovered" if self.info.get("recovered") else ""))
+
+    @property
     def data_file(self) -> str:
         """The file of the rows, relative to the dataset's folder."""
         return str(self._layout.data(self.place.data[0]).relative_to(self._layout.root))

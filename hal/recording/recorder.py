@@ -281,7 +281,8 @@ class Recorder:
         again.
 
         Args:
-            success: Mark of the episode; written at once, so that it survives if the writer is killed.
+            success: Mark of the episode; written at once, so that it survives if the writer is killed. An episode that
+                ended by itself, perhaps before the task, is not marked a success.
             wait: Block until the episode is saved.
             result: What else is known at the end, for the episode's metadata: as JSON, arrays as lists.
 
@@ -305,6 +306,9 @@ class Recorder:
         self, episode: EpisodeRecorder, partial: Path, success: bool | None, result: Mapping[str, Any] | None
     ) -> None:
         try:
+            if success and episode.trouble:
+                _LOG.warning("not marked a success: the recording ended before it was saved: %s", episode.trouble)
+                success = None
             if success is not None:
                 write_mark(partial, success)
             episode.clock.stop()

@@ -204,7 +204,7 @@ def measure_episode(episode: Episode) -> EpisodeSummary:
         dropped=int(episode.info.get("dropped") or 0),
         trips=int(tripped[0].sum() + np.sum(tripped[1:] & ~tripped[:-1])),
         task=episode.task,
-        trouble=str(episode.info.get("trouble") or ("recovered" if episode.info.get("recovered") else "")),
+        trouble=episode.trouble,
         pace=simulated_pace(episode.info),
         jerk=jerk,
         idle=idle,
@@ -302,8 +302,8 @@ def _title(canvas: SheetCanvas, content: EpisodeContent) -> float:
     length = f"{content.rows} rows at {episode.fps} Hz, {_end(content):.1f} s"
     facts = f"{length}, {info.get('robot_type')}{seed}{dropped}, started {info.get('started')}"
     canvas.text(_MARGIN, 56, facts, 14, GREY)
-    if info.get("trouble"):
-        canvas.text(_MARGIN, 76, str(info["trouble"])[:180], 14, _STATUS[RobotStatus.TRIPPED])
+    if episode.trouble:
+        canvas.text(_MARGIN, 76, episode.trouble[:180], 14, _STATUS[RobotStatus.TRIPPED])
     return 104
 
 

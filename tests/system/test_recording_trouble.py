@@ -156,7 +156,7 @@ def test_a_camera_that_is_lost(rig: Rig, out: Path) -> None:
         wait_until(lambda: "camera wrist is lost" in recorder.status().trouble)
         with pytest.raises(CommandError, match="save or discard"):
             recorder.start()
-        recorder.save(False, wait=True)
+        recorder.save(True, wait=True)
         with pytest.raises(ConnectionLost, match="camera wrist is lost"):
             recorder.start()
         rig.cameras["wrist"].inject(disconnect=False)
@@ -166,6 +166,7 @@ def test_a_camera_that_is_lost(rig: Rig, out: Path) -> None:
     usable(out, 15)
     first = Dataset(out).episodes[0]
     assert first.length >= 15
+    assert first.success is None, "not every picture of the task is there"
     assert "camera wrist is lost" in first.info["trouble"]
     assert first.info["gaps"][-1]["why"] == first.info["trouble"]
 

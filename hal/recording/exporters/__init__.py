@@ -115,6 +115,8 @@ def export(
         notes=list(source.notes),
     )
     job.check()
+    if early := [str(episode.number) for episode in wanted if episode.trouble]:
+        job.notes.append(f"recordings that ended by themselves, perhaps before the task: {', '.join(early)}")
     writer = import_module(f".{KINDS[kind][0]}", __name__)
     path = default_path(source.root, kind) if out is None else Path(out).expanduser().absolute()
     with write_atomically(path, force=force, is_ours=writer.is_export) as beside:

@@ -18,7 +18,7 @@ from app_kit import CIRCLE, CROSS, PS, SQUARE, seed_of, write_pad
 from engines_kit import need_engine
 
 import hal
-from hal.apps import collect
+from hal.apps import collect, dataset, export, replay
 from hal.apps._collecting import CollectRun
 from hal.camera import Camera
 from hal.drivers.mock.gamepad import MockPad
@@ -365,6 +365,13 @@ def test_a_recording_that_ends_by_itself_is_named_and_is_no_success(
     (episode,) = Dataset(tmp_path / "data").episodes
     assert episode.success is (None if end == PS else False)
     assert any("save, not marked" in view.prompt for view in page.views)
+    data = str(tmp_path / "data")
+    assert dataset.main(["list", data]) == 0
+    assert "[camera wrist has sent no picture]" in capsys.readouterr().out
+    assert replay.main([data, "--sim", "--set", "cameras={}", "--set", "simulation.clock=lock_step"]) == 0
+    assert "ended by itself: camera wrist" in capsys.readouterr().out
+    assert export.main([data, "--to", "npz"]) == 0
+    assert "that ended by themselves, perhaps before the task: 0" in capsys.readouterr().out
 
 
 def test_an_arm_that_is_not_simulated_drives_home_while_l2_is_held(
