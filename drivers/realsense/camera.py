@@ -124,7 +124,8 @@ class RealSenseCamera(CameraDriver):
         link = self._connect()
         began = time.monotonic()
         try:
-            opened = link.request("open", _OPEN, again=self._sessions > 0, first=self._starts == 0)
+            before = None if self._info is None else self._info.serial
+            opened = link.request("open", _OPEN, before=before, first=self._starts == 0)
             self._starts += 1
         except ConnectionLost as error:
             self._lost = self._sessions > 0

@@ -69,11 +69,11 @@ class RealSenseDevice:
         """Whether it streams, or did until its camera was lost."""
         return self._streamer is not None
 
-    def open(self, *, again: bool = False, first: bool = True) -> dict[str, Any]:
+    def open(self, *, before: str | None = None, first: bool = True) -> dict[str, Any]:
         """Find the camera, set its options, start it and wait for a first frame set.
 
         Args:
-            again: The camera was open before, so that its exposure has settled.
+            before: Serial number of the camera that was open before, whose exposure has settled: no other one will do.
             first: A recording made now is the first one of the program.
 
         Returns the camera's description as plain data: the fields of :class:`~hal.driver.CameraInfo`, ``notes`` (what
@@ -83,13 +83,13 @@ class RealSenseDevice:
         """
         self.close()
         try:
-            return self._open(again, first)
+            return self._open(before, first)
         except BaseException:
             self.close()
             raise
 
-    def _open(self, again: bool, first: bool) -> dict[str, Any]:
-        camera = self._find()
+    def _open(self, before: str | None, first: bool) -> dict[str, Any]:
+        camera = self._find(before)
         profiles = choose_profiles(camera.device, self._spec)
         sensors = find_sensors(camera.device)
         notes: tuple[str, ...] = ()
@@ -98,7 +98,7 @@ class RealSenseDevice:
         settles = not self._played and has_auto_exposure(sensors)
         option_values = read_options(sensors)
         self._pipeline = self._start(camera, profiles, first)
-        warm_up = min(self._settings.warm_up_s, _RESTART_WARM_UP) if again else self._settings.warm_up_s
+        warm_up = min(self._settings.warm_up_s, _RESTART_WARM_UP) if before else self._settings.warm_up_s
         self._streamer = FrameStreamer(
             self._spec,
             profiles,
@@ -125,13 +125,13 @@ class RealSenseDevice:
             **describe_optics(self._spec, camera.device, profiles, self._streamer.cropping),
         }
 
-    def _find(self) -> ConnectedCamera:
+    def _find(self, before: str | None = None) -> ConnectedCamera:
         settings = self._settings
         if settings.play is not None:
             return self._load(settings.play)
         if self._emulated is not None:
-            return find_camera(self._context, self._emulated.serial, self._spec.name)
-        camera = find_camera(self._context, settings.serial, self._spec.name)
+            return find_camera(self._context, before or self._emulated.serial, self._spec.name)
+        camera = find_camera(self._context, before or settings.serial, self._spec.name)
         self._lock = lock_camera(camera.serial)
         return camera
 

@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -54,6 +55,17 @@ def test_a_camera_works_again_after_it_was_unplugged() -> None:
         assert cam.counts().reconnects == 1
         wait_until(lambda: len(news) > 1)  # callbacks run after the frame is readable
         assert [type(item) for item in news] == [ConnectionLost, type(None)]
+
+
+def test_another_camera_does_not_take_the_place_of_one_that_was_unplugged() -> None:
+    """Without a serial number in the rig: it has another calibration than what is recorded."""
+    with opened(software()) as cam:
+        cam.read(timeout=PATIENCE)
+        cam._driver._info = replace(cam.info, serial="12345")
+        cam.inject(disconnect=True)
+        read_until_lost(cam)
+        cam.inject(disconnect=False)
+        wait_until(lambda: "no RealSense with serial 12345; connected: Intel" in str(read_until_lost(cam)))
 
 
 def test_a_silent_camera_is_lost_and_comes_back() -> None:
