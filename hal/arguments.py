@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -47,11 +48,18 @@ def number(
     return found
 
 
-def integer(name: str, value: Any, *, least: int) -> int:
-    """Return an integer of at least ``least``. Raises CommandError for anything else."""
+def integer(name: str, value: Any, *, least: int, code: str | None = None) -> int:
+    """Return an integer of at least ``least``. Raises CommandError, with this code, for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise CommandError(f"{name} must be a whole number of at least {least}, not {_show(value)}")
+        raise CommandError(f"{name} must be a whole number of at least {least}, not {_show(value)}", code=code)
     return int(value)
+
+
+def choice(name: str, value: str, choices: Collection[str], code: str | None = None) -> str:
+    """Return one of ``choices``. Raises CommandError, with this code, for anything else."""
+    if value not in choices:
+        raise CommandError(f"{name} must be one of {', '.join(choices)}, not {_show(value)}", code=code)
+    return value
 
 
 def vector(name: str, values: Any, size: int | None = None) -> Array:

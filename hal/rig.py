@@ -16,10 +16,11 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 
 from . import registry
+from .arguments import choice
 from .camera import Camera, find_place
 from .clock import Clock, LockStepClock, RealClock
 from .commands import StopLatch
-from .errors import CommandError, ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem, suggest
+from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem, suggest
 from .gamepad import Gamepad
 from .gripper import Gripper
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, make_groups, start_processes
@@ -513,8 +514,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     ]
     if wrong:
         raise ConfigError(wrong)
-    if viewer not in ("none", "3d"):
-        raise CommandError(f"viewer is 'none' or '3d', not {viewer!r}", code="unknown_viewer")
+    choice("viewer", viewer, ("none", "3d"), "unknown_viewer")
     if viewer == "3d":
         registry.load(registry.provider("viewer3d"), "viewer3d")
     if console or viewer == "3d" or any(chosen.input == "console" for chosen in pads):

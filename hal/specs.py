@@ -202,6 +202,16 @@ class RangesSpec:
     upper: Floats
 
 
+PRIMITIVES = {
+    "box": ("half_extents",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "plane": (),
+}
+"""Shapes of objects that need no file -> the sizes that each needs."""
+
+
 @dataclass(frozen=True)
 class BodySpec:
     """An object of the simulated world."""

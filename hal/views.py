@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from .arguments import choice, number
 from .errors import CommandError
 from .geometry import Pose
 from .host.hosts import Host
@@ -192,11 +192,9 @@ class DrivingView:
     def __post_init__(self) -> None:
         if not 0.0 < self.speed <= self.speed_max <= 1.0:
             raise CommandError(f"a speed must be above 0 and at most 1, not {self.speed} of {self.speed_max}")
-        if self.frame not in FRAMES:
-            raise CommandError(f"a frame must be one of {', '.join(FRAMES)}, not {self.frame!r}")
-        unknown = [name for name in self.settings if name not in SETTINGS]
-        if unknown:
-            raise CommandError(f"a setting must be one of {', '.join(SETTINGS)}, not {unknown[0]!r}")
+        choice("a frame", self.frame, FRAMES)
+        for name in self.settings:
+            choice("a setting", name, SETTINGS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,13 +233,10 @@ class RecordingView:
     """Those of :data:`ACTIONS` that are possible now."""
 
     def __post_init__(self) -> None:
-        if self.phase not in PHASES:
-            raise CommandError(f"a recording is one of {', '.join(PHASES)}, not {self.phase!r}")
-        wrong = [action for action in self.actions if action not in ACTIONS]
-        if wrong:
-            raise CommandError(f"an action is one of {', '.join(ACTIONS)}, not {wrong[0]!r}")
-        if not (math.isfinite(self.seconds) and self.seconds >= 0.0):
-            raise CommandError(f"seconds must be finite and at least 0, not {self.seconds}")
+        choice("a phase", self.phase, PHASES)
+        for action in self.actions:
+            choice("an action", action, ACTIONS)
+        number("seconds", self.seconds, least=0.0)
 
 
 class WorldView(ABC):

@@ -8,18 +8,10 @@ from dataclasses import dataclass, field
 from hal.errors import ConfigError, Problem
 from hal.kinematics.hulls import Hull, mesh_hulls
 from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml
-from hal.specs import BodySpec, GripperSpec, RobotSpec
+from hal.specs import PRIMITIVES, BodySpec, GripperSpec, RobotSpec
 
 from .values import listed
 
-_PRIMITIVES = {
-    "box": ("half_extents",),
-    "sphere": ("radius",),
-    "cylinder": ("radius", "length"),
-    "capsule": ("radius", "length"),
-    "plane": (),
-}
-"""Shapes of objects that need no file -> the sizes that each needs."""
 PAD_FRICTION = (1.0, 0.1)
 """Lateral and spinning friction of a gripper's pads: rubber."""
 UNKNOWN_EFFORT = 200.0
@@ -33,14 +25,14 @@ def primitive_size(spec: BodySpec) -> tuple[float, ...]:
 
     Raises ConfigError if the record lacks it, or there is no such shape.
     """
-    if spec.shape not in _PRIMITIVES:
-        message = f"is {spec.shape!r}; shapes: {', '.join(_PRIMITIVES)}, mesh, urdf"
+    if spec.shape not in PRIMITIVES:
+        message = f"is {spec.shape!r}; shapes: {', '.join(PRIMITIVES)}, mesh, urdf"
         raise ConfigError([Problem("objects", f"objects.{spec.name}.shape", message, "unknown_shape")])
-    for name in _PRIMITIVES[spec.shape]:
+    for name in PRIMITIVES[spec.shape]:
         if getattr(spec, name) is None:
             message = f"is missing, and a {spec.shape} needs it"
             raise ConfigError([Problem("objects", f"objects.{spec.name}.{name}", message, "missing_key")])
-    sizes = [getattr(spec, name) for name in _PRIMITIVES[spec.shape]]
+    sizes = [getattr(spec, name) for name in PRIMITIVES[spec.shape]]
     return tuple(float(side) for side in (sizes[0] if spec.shape == "box" else sizes))
 
 

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, model_validator
 
 from ..errors import suggest
 from ..kinematics.urdf import UrdfModel
-from ..specs import BodySpec, RangesSpec, Vector3
+from ..specs import PRIMITIVES, BodySpec, RangesSpec, Vector3
 from .context import Context, find_mesh, load_urdf
 from .files import Problems, find_file, read_yaml, validate
 from .models import FileSource
@@ -69,15 +69,7 @@ class RandomPose(Strict):
         return RangesSpec(tuple(least for least, _ in ends), tuple(greatest for _, greatest in ends))
 
 
-SIZES = {
-    "box": ("half_extents",),
-    "sphere": ("radius",),
-    "cylinder": ("radius", "length"),
-    "capsule": ("radius", "length"),
-    "plane": (),
-    "mesh": ("mesh",),
-    "urdf": ("urdf",),
-}
+SIZES = {**PRIMITIVES, "mesh": ("mesh",), "urdf": ("urdf",)}
 """The keys that each shape needs, and that no other shape may have."""
 PLACES = frozenset({"position", "pose", "attached"})
 """Keys that place an object. The random ranges of its file are for the place that the file gives it."""

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import number
+from ..arguments import choice, number
 from ..camera import Camera
 from ..commands import FIRST_STEP_ANGLE, CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Twist
 from ..control import Control
@@ -142,9 +142,7 @@ class EnvSettings:
         for name in ("cameras", "streams", "objects"):
             if isinstance(value := getattr(self, name), str):
                 raise CommandError(f"{name} must be a list of names: [{value!r}]", code="not_a_list")
-        if self.action not in get_args(ActionKind):
-            known = ", ".join(get_args(ActionKind))
-            raise CommandError(f"action must be one of {known}, not {self.action!r}", code="unknown_action")
+        choice("action", self.action, get_args(ActionKind), "unknown_action")
         number("rate_hz", self.rate_hz, "Hz", least=0.0, above=True)
 
 

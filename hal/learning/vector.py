@@ -34,6 +34,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ..arguments import choice, integer
 from ..errors import CommandError, ConnectionLost, HalError, NotSupported
 from ..host.process import START_TIMEOUT, Channel, Child, SharedMemory, pack_error, serve, unpack_error
 from . import gym
@@ -80,13 +81,10 @@ def make_vec(
         DriverMissing: gymnasium is not installed.
     """
     processes = _cores() if processes is None else processes
-    counts: tuple[tuple[str, Any], ...] = (("num_envs", num_envs), ("processes", processes))
-    for name, count in counts:
-        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
-            raise CommandError(f"{name} is a whole number of at least 1, not {count!r}", code="bad_count")
-    modes = [mode.value for mode in AutoresetMode]
-    if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
-        raise CommandError(f"autoreset_mode is one of {', '.join(modes)}, not {autoreset_mode!r}", code="bad_autoreset")
+    for name, count in (("num_envs", num_envs), ("processes", processes)):
+        integer(name, count, least=1, code="bad_count")
+    if not isinstance(autoreset_mode, AutoresetMode):
+        choice("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode], "bad_autoreset")
     if callable(env):
         make = partial(env, **options)
     else:

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CommandError, NotSupported
+from ..arguments import choice
+from ..errors import NotSupported
 from .codecs import PictureStats
 from .layout import file_version
 
@@ -68,9 +69,7 @@ def choose_encoder(codec: str) -> VideoEncoder:
     """
     import av
 
-    known = [encoder.codec for encoder in _ENCODERS]
-    if codec not in ("auto", *known):
-        raise CommandError(f"codec must be auto, {' or '.join(known)}, not {codec!r}", code="bad_codec")
+    choice("codec", codec, ("auto", *(encoder.codec for encoder in _ENCODERS)), "bad_codec")
     for encoder in _ENCODERS:
         if codec in ("auto", encoder.codec) and encoder.library in av.codecs_available:
             return encoder

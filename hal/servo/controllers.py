@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arguments import number, vector
+from ..arguments import choice, number, vector
 from ..errors import CommandError
 from ..types import ControlMode
 from .torque_bounds import RATE, ArmInMotion, Inertia, TcpInMotion
@@ -106,8 +106,7 @@ class OperationalSpace:
 
     def __post_init__(self) -> None:
         _check_gains(self, ("stiffness", "rotation_stiffness", "rate", "rotation_rate"), 3)
-        if self.frame not in ("base", "tcp"):
-            raise CommandError(f"frame must be 'base' or 'tcp', not {self.frame!r}", code="bad_controller")
+        choice("frame", self.frame, ("base", "tcp"), "bad_controller")
         if self.posture_stiffness is not None:
             number("posture_stiffness", self.posture_stiffness, "Nm/rad", least=0.0, most=_STIFFEST)
         if self.posture is not None:

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import ArrayLike, NDArray
 
+from ...arguments import choice
 from ...deadman import Deadman
 from ...errors import CommandError
 from ...geometry import Pose
@@ -152,7 +153,9 @@ class TaskEnv(RigEnv):
         unattended: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        _check_choices(reward_type=(reward_type, RewardType), judge=(judge, Judge))
+        choice("reward_type", reward_type, get_args(RewardType), "bad_reward_type")
+        if judge is not None:
+            choice("judge", judge, get_args(Judge), "bad_judge")
         self._sparse = reward_type == "sparse"
         self.poses: dict[str, Pose] = {}
         """Pose of each object in the arm's base frame, at the newest observation in which it was seen."""
@@ -469,11 +472,3 @@ class TaskEnv(RigEnv):
             "objects": ["floor", "table", *entries],
             "collisions": {"boxes": [table | {"position": [0, 0, 0.5645]}]},  # 10.5 mm lower, for the margin of 10 mm
         }
-
-
-def _check_choices(**choices: tuple[Any, Any]) -> None:
-    """Raise CommandError for a value that is none of those allowed."""
-    for name, (value, kind) in choices.items():
-        if value is not None and value not in get_args(kind):
-            text = f"{name} is {' or '.join(get_args(kind))}, not {value!r}"
-            raise CommandError(text, code=f"bad_{name}")

@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
+from ...arguments import choice
 from ...errors import CommandError
 from ..dataset import Dataset
 from ..layout import count_bytes
@@ -95,8 +96,7 @@ def export(
         DriverMissing: A library is not installed.
         OSError: The disk refuses.
     """
-    if kind not in KINDS:
-        raise CommandError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}", code="bad_export")
+    choice("kind", kind, KINDS, "bad_export")
     if not 0.0 <= valid < 1.0:
         raise CommandError(f"valid must be at least 0 and below 1, not {valid:g}", code="bad_export")
     if size is not None and not all(1 <= side <= 8192 for side in size):

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...arguments import choice
 from ...errors import CommandError
 from ...geometry import apply_rotation, difference, quaternion_to_matrix
 from ..layout import ACTION, SETPOINT
@@ -46,17 +47,13 @@ class ActionForm(NamedTuple):
 
     def checked(self) -> ActionForm:
         """Return the form with a rotation where it needs one. Raises CommandError (code ``bad_export``)."""
-        if self.kind not in get_args(ActionKind):
-            raise CommandError(
-                f"action must be one of {', '.join(get_args(ActionKind))}, not {self.kind!r}", code="bad_export"
-            )
+        choice("action", self.kind, get_args(ActionKind), "bad_export")
         if self.kind.startswith("joint"):
             if self.rotation is not None:
                 raise CommandError(f"actions of {self.kind} have no rotation", code="bad_export")
             return self
         rotation = self.rotation or "quaternion"
-        if rotation not in _NAMES:
-            raise CommandError(f"rotation must be one of {', '.join(_NAMES)}, not {rotation!r}", code="bad_export")
+        choice("rotation", rotation, _NAMES, "bad_export")
         return ActionForm(self.kind, rotation)
 
     def names(self, content: EpisodeContent) -> list[str]:
