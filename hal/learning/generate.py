@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 from ..errors import CommandError, ConnectionLost, HalError
 from ..host.process import Child
-from ..recording.dataset import Episode
 from ..recording.layout import DatasetLayout, require_libraries
 from ..recording.merging import merge
 from .episode_worker import EpisodeRecipe, EpisodeResult, check_recipe, clean_part
@@ -428,11 +427,7 @@ class _GenerateRun:
             parts += self._uploads.download(downloads)
         if parts:
             have = [self._out] if DatasetLayout(self._out).info.exists() else []
-            merge([*have, *parts], self._out, key=_number)
+            merge([*have, *parts], self._out, key=lambda episode: int(episode.info["info"]["episode"]))
         shutil.rmtree(self._parts, ignore_errors=True)
         if self._uploads is not None:
             self._uploads.remove()
-
-
-def _number(episode: Episode) -> int:
-    return int(episode.info["info"]["episode"])
