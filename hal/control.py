@@ -49,6 +49,8 @@ if TYPE_CHECKING:
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
 """Deadline of the next command after one: so many periods of the session's rate, at least the shortest, s."""
+_REFUSED = "a first target too far away, too late, or torques and another kind of command without a rest in between"
+"""Why the servo refuses a command."""
 _MOST_AT_ONCE = 100
 """Number of commands in a row without any passing of time that counts as a mistake: a lock-step clock stands still."""
 _REST_LIMIT = 5.0
@@ -347,10 +349,7 @@ class Control:
             reasons.append(f"the servo limits the motion: {servo.limited}")
         if servo.session == self._id and servo.refused > self._refused:
             self._refused = servo.refused
-            reasons.append(
-                "the servo refused an earlier command: a first target too far away, too late, or torques and another "
-                "kind of command without a rest in between"
-            )
+            reasons.append(f"the servo refused an earlier command: {_REFUSED}")
         target = self._finger_target(grip, width, force)
         if command is not None:
             command = self._send_command(command, servo, now, t_event, waiting, reasons)
@@ -453,6 +452,8 @@ class Control:
 
     def _details(self, servo: ServoRecord) -> str:
         """Return what to add to the words for a trip."""
+        if servo.trip is Trip.COMMAND_LATE and servo.refused > servo.target_seq:
+            return f" that the servo can follow; it refused newer ones: {_REFUSED}"
         if servo.trip is Trip.COMMAND_LATE:
             longest = f"at most {1e3 * self._deadline:.0f} ms may pass between two at rate_hz={self._rate_hz:g}"
             return f" ({longest}; for a slower loop pass a lower rate_hz, or send chunks)"

@@ -443,6 +443,7 @@ class Servo:
             course.seq = command.seq
             if not self._follow(now, command):
                 self.report.refused = command.seq
+                watchdog.refuse(command)
 
     def _follow(self, now: float, command: CommandRecord) -> bool:
         """Follow a command from now on; return whether that is possible."""

@@ -66,6 +66,8 @@ class Watchdog:
         """Number of the rearms that were handled; one waits until the arm is at rest."""
         self._command: CommandRecord | None = None
         """The command that the arm follows."""
+        self._refused = 0
+        """Number of the newest command that the arm cannot follow."""
 
     def open_session(self, session: Session, inbox: Inbox) -> None:
         """Open a session. Presses and rearms count from those in ``inbox``, stops from those that the app knew of."""
@@ -89,6 +91,10 @@ class Watchdog:
     def expect(self, command: CommandRecord | None) -> None:
         """Expect the next command before the deadline of this one; None if none is due."""
         self._command = command
+
+    def refuse(self, command: CommandRecord) -> None:
+        """Note that the arm does not follow a command, so that it does not count as one in time."""
+        self._refused = command.seq
 
     def update(self, now: float, inbox: Inbox, at_rest: bool, device: Trip = Trip.NONE, late: bool = False) -> bool:
         """Decide for one tick at ``now``, s; motion only starts from a set-point at rest.
@@ -145,11 +151,16 @@ class Watchdog:
         return _NONE
 
     def _is_late(self, now: float, session: Session, newest: CommandRecord | None) -> bool:
-        """Return whether a command is due, and neither the one that is followed nor a newer one is still in time."""
+        """Return whether a command is due, and neither the one that is followed nor a newer one is still in time.
+
+        After one that was refused, a newer one counts once it is followed.
+        """
         followed = self._command
         if followed is None or is_timely(now, followed):
             return False
         if newest is None or newest.session != session.id or newest.seq <= followed.seq:
+            return True
+        if self._refused > followed.seq:
             return True
         return not is_timely(now, newest)
 

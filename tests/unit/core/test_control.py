@@ -199,6 +199,21 @@ def test_a_pose_beyond_reach_is_refused_in_mid_session_too(rig: hal.Rig, arm: ha
             control.send(hal.CartesianTarget(hal.Pose(pose.position * 1000.0, pose.orientation)))  # mm
 
 
+@pytest.mark.parametrize("rate_hz", [50, 1000])
+def test_commands_that_the_servo_refuses_do_not_keep_the_arm_moving(
+    rig: hal.Rig, arm: hal.Robot, rate_hz: float
+) -> None:
+    """Not even where a new one is there in every tick. The deadline is that of the last one that was followed."""
+    with arm.control(rate_hz=50) as control:
+        drive(rig, control, count=20)
+        last = rig.clock.now()
+        with pytest.raises(MotionStopped, match="refused newer ones: a first target too far away") as stop:
+            for tick in rig.clock.rate(rate_hz):
+                control.send(JointTarget(arm.home + 0.5))
+                assert tick.t - last < 0.2
+        assert stop.value.code == "command_deadline"
+
+
 def test_a_loop_in_which_no_time_passes_is_an_error(rig: hal.Rig, arm: hal.Robot) -> None:
     with arm.control(rate_hz=50) as control:
         drive(rig, control, count=150)
