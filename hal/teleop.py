@@ -322,7 +322,7 @@ SessionEventKind = Literal[
 * ``robot_changed``: the pad drives another arm, chosen with the mapping's button or on a page of the console.
 * ``scene_reset``, ``setting_refused``: a page of the console reset the simulated scene; the arm or the frame was to be
   changed while the dead-man was held, which has no effect.
-* ``gripper_fault``, ``gripper_recovered``: the gripper does not answer, or answers again; the arm continues without it.
+* ``gripper_fault``, ``gripper_recovered``: the gripper does not answer or refuses, or no longer so; the arm continues.
 * ``message``: text of the program, see :meth:`TeleopSession.announce`.
 """
 
@@ -482,7 +482,8 @@ class ArmTeleop:
         if trouble and _kind_of(trouble) != _kind_of(self.gripper_trouble):
             self.announce(f"GRIPPER: {trouble}", "gripper_fault", trouble)
         elif self.gripper_trouble and not trouble:
-            self.announce("the gripper answers again", "gripper_recovered")
+            does = "takes commands" if " failed: " in self.gripper_trouble else "answers"
+            self.announce(f"the gripper {does} again", "gripper_recovered")
         self.gripper_trouble = trouble
 
     def note_trouble(self, error: Exception) -> None:

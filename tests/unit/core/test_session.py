@@ -283,7 +283,8 @@ def test_each_trouble_of_a_gripper_is_announced_and_a_press_after_it_moves_the_f
     assert [("too hot" in text, "disconnect" in text) for text in told] == [(True, False), (False, True)] * 2 + [
         (True, False)
     ]
-    assert bench.kinds.count("gripper_recovered") == 1
+    recovered = [event.text for event in bench.events if event.kind == "gripper_recovered"]
+    assert recovered == ["the gripper takes commands again"], "it answered all the time"
     assert fingers.state().width < 0.01
 
 
