@@ -62,7 +62,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
         page.report(channel)
         return max(0.0, due - time.monotonic())
 
-    methods: Any = {"clear": page.clear_goals, "edited": page.note_edit, "forces": page.show_forces}
+    methods: Any = {"clear": page.clear_goal, "edited": page.note_edit, "forces": page.show_forces}
     serve(channel, methods, update)
 
 
@@ -137,10 +137,6 @@ class ViewerPage:
             "/forces", np.zeros((1, 2, 3)), _PINK, shaft_radius=0.003, head_radius=0.01, head_length=0.02, visible=False
         )
         set_camera(server, self.arms)
-        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="small")
-        server.gui.main_panel.minimize()
-        reset_button = server.gui.add_button("Reset gizmo", hint="Put it back to the tool, and clear its goal.")
-        reset_button.on_click(lambda _: self.clear_goals(None))
         server.on_client_disconnect(self._on_disconnect)
 
     def _draw_shapes(self, groups: Sequence[GroupSpec]) -> dict[str, ShapesView]:
@@ -163,10 +159,10 @@ class ViewerPage:
         for arm in self.arms:
             arm.drag.leave(PAGE.get())
 
-    def clear_goals(self, robot: str | None) -> None:
-        """Put the handle of one arm, or those of all, back to the tcp, and clear the goal."""
+    def clear_goal(self, robot: str) -> None:
+        """Put the handle of an arm back to the tcp, and clear the goal."""
         for arm in self.arms:
-            if robot in (None, arm.spec.name):
+            if robot == arm.spec.name:
                 arm.drag.clear()
 
     def show_forces(self, arrows: Sequence[Sequence[Sequence[float]]]) -> None:

@@ -138,13 +138,13 @@ class Bench:
 class Browser:
     """Headless Chromium with one profile of its own."""
 
-    def __init__(self, width: int = 1280, height: int = 800) -> None:
+    def __init__(self, width: int = 1280, height: int = 800, flags: Sequence[str] = FLAGS) -> None:
         from selenium import webdriver
 
         options = webdriver.ChromeOptions()
         options.binary_location = CHROMIUM
         self._profile = tempfile.mkdtemp(prefix="hal-browser-")
-        for flag in (*FLAGS, f"--user-data-dir={self._profile}", f"--window-size={width},{height}"):
+        for flag in (*flags, f"--user-data-dir={self._profile}", f"--window-size={width},{height}"):
             options.add_argument(flag)
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
         service = webdriver.ChromeService(executable_path=CHROMEDRIVER)

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
+import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 import pytest
 
@@ -72,3 +77,61 @@ def lines(page: Browser, words: str) -> int:
     script = """return [...log.children].filter((one) => one.dataset.text.includes(arguments[0]))
         .reduce((sum, one) => sum + Number(one.dataset.count), 0)"""
     return int(page.run(script, words))
+
+
+HANG = "const t = performance.now(); while (performance.now() - t < 600);"
+BLUR = "window.dispatchEvent(new Event('blur')); window.dispatchEvent(new Event('focus'))"
+TAKE = """window.other = new WebSocket(`ws://${location.host}/live`, ['hal.v1', location.hash.slice(1)]);
+    other.onopen = () => other.send('{"type": "lease", "take": true}')"""
+TROUBLE: dict[str, Callable[[Bench, Browser], object]] = {
+    "the robot reports a fault": lambda bench, page: bench.arm.inject(fault="joint 3 is too warm"),
+    "the robot does not answer": lambda bench, page: bench.arm.inject(disconnect=True),
+    "somebody pressed STOP": lambda bench, page: page.tap("Escape", "Escape"),
+    "the page's computer was busy": lambda bench, page: page.run(HANG),
+    "the robot's computer was busy": lambda bench, page: stall_console(bench),
+    "the page in control was closed": lambda bench, page: page.chrome.refresh(),
+    "another page is in control": lambda bench, page: page.run(TAKE),
+    "the window lost the keyboard": lambda bench, page: page.run(BLUR),
+}
+"""Rows of the table in docs/console.md -> what happens to a page in control whose arm moves."""
+SHOWN = """return (overlay.hidden ? [...banners.children] : [overlay]).filter((one) => one.checkVisibility())
+    .map((one) => [...one.querySelectorAll('b, span, h2, p')].map((part) => part.innerText))"""
+
+
+@contextlib.contextmanager
+def frozen_console(bench: Bench) -> Iterator[None]:
+    """Stop the process of the console, as a busy computer does."""
+    process = bench.console._child.process.pid
+    os.kill(process, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(process, signal.SIGCONT)
+
+
+def stall_console(bench: Bench) -> None:
+    with frozen_console(bench):
+        time.sleep(0.3)
+
+
+def end_trouble(bench: Bench, page: Browser) -> None:
+    """Take back what lasts."""
+    page.run("window.other?.close()")
+    bench.arm.inject(disconnect=False, fault=None)
+
+
+def row_of_docs(what: str) -> list[str]:
+    """Return what the page shows, and what to do next, as patterns."""
+    text = (Path(__file__).parents[2] / "docs/console.md").read_text(encoding="utf-8")
+    row = next(line for line in text.splitlines() if line.startswith(f"| {what} |"))
+    return [re.sub(r"\\\*[^*]*\\\*", ".*", re.escape(cell)) for cell in row.strip("| ").split(" | ")[1:]]
+
+
+def shows_trouble(page: Browser, what: str) -> bool:
+    """Return whether the page shows this row of the docs' table, and nothing else."""
+    says, asks = row_of_docs(what)
+    asks = asks.replace(r"Hold\ .*\ to\ continue", ".*")  # what is still down must be released first
+    shown = page.run(SHOWN)
+    if len(shown) != 1 or not re.fullmatch(says, shown[0][0], re.IGNORECASE):
+        return False
+    return any(re.fullmatch(asks, part) for part in shown[0][1:])

@@ -5,19 +5,13 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 
 from .cable import Cable
 from .kit import Bench, Browser, wait_for
-from .moves import drive_left, lines, undisturbed
-
-HANG = "const t = performance.now(); while (performance.now() - t < 600);"
-BLUR = "window.dispatchEvent(new Event('blur')); window.dispatchEvent(new Event('focus'))"
-TAKE = """window.other = new WebSocket(`ws://${location.host}/live`, ['hal.v1', location.hash.slice(1)]);
-    other.onopen = () => other.send('{"type": "lease", "take": true}')"""
+from .moves import HANG, TROUBLE, drive_left, end_trouble, lines, row_of_docs, shows_trouble, undisturbed
 
 
 @pytest.fixture
@@ -89,42 +83,14 @@ def test_a_frozen_browser(bench: Bench, moving: Browser) -> None:
     goes_on_after_release_and_press(bench, moving)
 
 
-TROUBLE: dict[str, Callable[[Bench, Browser], object]] = {
-    "somebody pressed STOP": lambda bench, page: page.tap("Escape", "Escape"),
-    "the robot reports a fault": lambda bench, page: bench.arm.inject(fault="joint 3 is too warm"),
-    "the robot does not answer": lambda bench, page: bench.arm.inject(disconnect=True),
-    "the page's computer was busy": lambda bench, page: page.run(HANG),
-    "the window lost the keyboard": lambda bench, page: page.run(BLUR),
-    "the page in control was closed": lambda bench, page: page.chrome.refresh(),
-    "another page is in control": lambda bench, page: page.run(TAKE),
-}
-SHOWN = """return [...banners.children].filter((one) => one.checkVisibility())
-    .map((one) => [...one.querySelectorAll('b, span')].map((part) => part.innerText))"""
-
-
-def row_of_docs(what: str) -> list[str]:
-    """Return what the page shows, and what to do next, as patterns."""
-    text = (Path(__file__).parents[2] / "docs/console.md").read_text(encoding="utf-8")
-    row = next(line for line in text.splitlines() if line.startswith(f"| {what} |"))
-    return [re.sub(r"\\\*[^*]*\\\*", ".*", re.escape(cell)) for cell in row.strip("| ").split(" | ")[1:]]
-
-
 @pytest.mark.parametrize("what", TROUBLE)
 def test_each_trouble_is_one_state_and_one_sentence(bench: Bench, moving: Browser, what: str) -> None:
     """The table of the docs, row by row."""
-    says, asks = row_of_docs(what)
-    asks = asks.replace(r"Hold\ .*\ to\ continue", ".*")  # what is still down must be released first
-
-    def told() -> bool:
-        shown = moving.run(SHOWN)
-        return len(shown) == 1 and bool(re.fullmatch(says, shown[0][0]) and re.fullmatch(asks, shown[0][1]))
-
     try:
         TROUBLE[what](bench, moving)
-        wait_for(told, f"{what}: {says}: {asks}")
+        wait_for(lambda: shows_trouble(moving, what), f"{what}: {row_of_docs(what)}")
     finally:
-        moving.run("window.other?.close()")
-        bench.arm.inject(disconnect=False, fault=None)
+        end_trouble(bench, moving)
 
 
 def test_a_page_that_hangs_names_the_busy_computer(bench: Bench, moving: Browser) -> None:
@@ -248,11 +214,12 @@ def test_a_network_that_is_cut_and_comes_back(bench: Bench, browser: Browser) ->
         cable.cut()
         time.sleep(0.4)
         cable.mend()
-        wait_for(
-            lambda: re.match(row_of_docs("the network was slow")[0], browser.text("#trip-text")), "the slow network"
-        )
+        wait_for(lambda: shows_trouble(browser, "the network was slow"), "the slow network")
         browser.key("ArrowLeft", "ArrowLeft", False)
         browser.let_go()
+        cable.cut()
+        wait_for(lambda: shows_trouble(browser, "the connection is lost"), "the lost connection")
+        cable.mend()
         bring_home(bench)
         browser.chrome.get("about:blank")
     finally:

@@ -37,7 +37,6 @@ class PlainPage:
             self.socket = unix_connect(address, "ws://viser/", **options)
         self.nodes: dict[str, dict[str, Any]] = {}
         """Newest ``position``, ``wxyz``, ``visible``, and properties that changed, of each node, by name."""
-        self.buttons: dict[str, str] = {}
         self.say(
             "ViewerCameraMessage",
             wxyz=(1, 0, 0, 0),
@@ -62,10 +61,6 @@ class PlainPage:
             self.say("TransformControlsUpdateMessage", name=name, position=position, wxyz=wxyz)
         if let_go:
             self.say("TransformControlsDragEndMessage", name=name)
-
-    def press(self, label: str) -> None:
-        """Press a button of the panel."""
-        self.say("GuiUpdateMessage", uuid=self.buttons[label], updates={"value": True})
 
     def hear(self) -> None:
         """Evaluate the received messages."""
@@ -99,8 +94,6 @@ class PlainPage:
                 if isinstance(value, dict):
                     value = np.frombuffer(arrays[value["__binary_index"]], value["dtype"])
                 self.nodes.setdefault(name, {})[key] = value
-        elif kind == "GuiButtonMessage":
-            self.buttons[message["props"]["label"]] = message["uuid"]
 
     def close(self) -> None:
         """Close the connection."""

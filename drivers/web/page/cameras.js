@@ -199,8 +199,8 @@ function renderer3D() {
   return gl ? String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) : "";
 }
 
-/** Style that hides viser's warning that there is no GPU. */
-const UNNEEDED = "#webgl-software-rendering { display: none }";
+/** Style that leaves viser's drawing only, on the ground of this page: its panel and its warnings would cover it. */
+const DRAWING = "body { background: none !important; visibility: hidden } canvas { visibility: visible }";
 
 /** The 3D view, of the rig's own program (drivers/viser). It takes any shape, and opens when it is enlarged. */
 class Stage {
@@ -224,7 +224,7 @@ class Stage {
     const keep = (/** @type {Event} */ event) => event.preventDefault();
     frame.addEventListener("load", () => {
       for (const type of ["mousedown", "contextmenu", "dragstart"]) frame.contentDocument?.addEventListener(type, keep, true);
-      if (this.opened) frame.contentDocument?.head.append(make("style", "", UNNEEDED)); // its caption says so
+      if (this.opened) frame.contentDocument?.head.append(make("style", "", DRAWING));
     });
     addEventListener("blur", () => setTimeout(() => document.activeElement === frame && (frame.blur(), focus())));
     const caption = make("figcaption");

@@ -72,6 +72,7 @@ export class Status {
   }
 
   #noticeTimer = 0;
+  #heldAt = 0; // ms
   /** Why the pad was lost last, and whether that was unintended. */
   #loss = { text: "", alarm: false };
   /** Who pressed STOP last, and when; "" if unknown. */
@@ -226,6 +227,7 @@ export class Status {
    * @param {boolean} playing
    */
   advise(present, held, pushed, playing) {
+    if (held && !this.held) this.#heldAt = performance.now();
     this.held = held;
     this.present = present;
     show(byId("focus"), this.lease.mine && !present);
@@ -247,7 +249,8 @@ export class Status {
     if (playing) return "The tour is playing.";
     if (!held) return pushed ? `Hold ${hold} too: the arm moves only while it is held.` : `Stopped. Hold ${hold} to move.`;
     if (this.deadman !== "held") return `Hold signal not received${this.#slow}`;
-    if (this.status === "holding") return this.#again(); // held since before a session began
+    // Held since before a session began; one that begins with the press takes a moment.
+    if (this.status === "holding" && performance.now() - this.#heldAt > OLD) return this.#again();
     return this.moving ? "Moving" : "Ready";
   }
 
