@@ -89,6 +89,8 @@ def test_each_trouble_is_one_state_and_one_sentence(bench: Bench, moving: Browse
     try:
         TROUBLE[what](bench, moving)
         wait_for(lambda: shows_trouble(moving, what), f"{what}: {row_of_docs(what)}")
+        if what == "the robot does not answer":
+            wait_for(lambda: moving.text("#waiting") == "Arm state unknown.", "the same beside the button")
     finally:
         end_trouble(bench, moving)
 

@@ -238,6 +238,7 @@ setInterval(() => {
   const pages = state.pages;
   setText(byId("pages"), `${pages} page${pages === 1 ? "" : "s"}`);
   status.show(state.robots, settings.robot || panel.name, silence());
+  advise();
   controls.slider.mark(panel.closed(state));
   panel.paint(state, silence());
 }, REPAINT);

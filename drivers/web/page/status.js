@@ -244,6 +244,7 @@ export class Status {
       return free ? TAKE : `${this.lease.text}.`;
     }
     if (!present) return "Click this page to continue.";
+    if (this.status === "lost" || this.status === "no data") return "Arm state unknown.";
     if (this.faulty) return 'The arm has a fault: press "Recover".';
     if (this.mustRelease || this.trip !== "none") return this.#resume();
     if (playing) return "The tour is playing.";
