@@ -10,7 +10,7 @@ from dataclasses import replace
 from hal.config import load
 from hal.testing import RobotBench
 
-from ..wire.ur_kit import UrEmulator
+from ..wire.network_kit import UrEmulator
 from .apart import Apart
 
 __all__ = ["Ur"]

@@ -9,7 +9,7 @@ from dataclasses import replace
 from hal.config import load
 from hal.testing import GripperBench, RobotBench
 
-from ..wire.xarm_kit import XArmEmulator
+from ..wire.network_kit import XArmEmulator
 
 __all__ = ["XArm7"]
 

@@ -138,3 +138,16 @@ def test_a_host_that_is_killed_is_told_by_the_next_call() -> None:
     with pytest.raises(ConnectionLost):
         rig.world.pose("cube")
     rig.close()
+
+
+def test_a_host_that_is_killed_ends_a_motion() -> None:
+    rig = hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=["cameras={}"])
+    motion = rig.robots["panda"].start_move_to(rig.robots["panda"].home + 0.2)
+    wait_until(lambda: motion.progress > 0.05)
+    os.kill(rig._hosts[0].child.process.pid, signal.SIGKILL)
+    with pytest.raises(hal.ConnectionLost):
+        motion.wait(10.0)
+    with pytest.raises(hal.ConnectionLost):
+        assert motion.done
+    with pytest.raises(hal.ConnectionLost):  # the motion was not over
+        rig.close()

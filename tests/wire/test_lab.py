@@ -24,7 +24,7 @@ from hal_emulators.robotiq.server import RobotiqEmulator, find_grippers
 from hal_emulators.shared_world import has_world
 
 from .franka_kit import free_host
-from .ur_kit import PORTS
+from .network_kit import UR_PORTS
 
 START = 60.0
 
@@ -69,7 +69,7 @@ def config(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     """A UR5e with a Robotiq 2F-85 and a cube, and on request a YAM behind it, at addresses of this test's own."""
     channel = f"239.74.{128 + os.getpid() // 250 % 100}.{1 + os.getpid() % 250}"
     path = find_data("config", "ur5e_robotiq.yaml")
-    text = path.read_text(encoding="utf-8").replace("127.0.0.2", free_host((*PORTS, 63352)))
+    text = path.read_text(encoding="utf-8").replace("127.0.0.2", free_host((*UR_PORTS, 63352)))
     rig = yaml.safe_load(text)
     rig["cameras"]["scene"]["capture"]["rate_hz"] = 6
     if getattr(request, "param", None) == "yam":  # all of it in motion in real time is too much for two processors

@@ -17,8 +17,7 @@ import pytest
 
 from hal.geometry import Pose
 
-from .ur_kit import UrEmulator
-from .xarm_kit import XArmEmulator
+from .network_kit import UrEmulator, XArmEmulator
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 

@@ -17,7 +17,7 @@ from webcam_kit import grey, webcams
 from hal.apps import collect, replay
 from hal.recording import Dataset
 
-from .ur_kit import UrEmulator
+from .network_kit import UrEmulator
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 

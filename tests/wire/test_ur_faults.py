@@ -12,7 +12,7 @@ from waiting import wait_until
 import hal
 from hal_emulators.control import EmulatorControl
 
-from .ur_kit import UrEmulator
+from .network_kit import UrEmulator
 
 pytestmark = [pytest.mark.slow, pytest.mark.pair]
 

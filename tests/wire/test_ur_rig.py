@@ -23,19 +23,13 @@ from hal.drivers.ur.preflight import check
 from hal_emulators.ur.controller import Controller
 from hal_emulators.ur.motion import forward
 
+from .network_kit import UrEmulator, check_same_poses, kill_app
 from .test_ur_faults import recover, wait_code
-from .ur_kit import UrEmulator
 
 pytestmark = [pytest.mark.slow, pytest.mark.pair]
 
 STOPS_WITHIN = 0.150
 """From the end of the host's messages to the end of the program, s."""
-APP = """
-import sys, hal, json
-with hal.open(json.loads(sys.argv[1])) as rig, rig.robots["arm"].control(rate_hz=50, unattended=True) as control:
-    for tick in rig.clock.rate(50):
-        control.send(hal.JointVelocity([0, 0, 0, 0.1, 0, 0]))
-"""
 
 
 @pytest.fixture
@@ -117,33 +111,13 @@ def test_the_arm_stands_150_ms_after_the_last_message(emulator: UrEmulator) -> N
 
 
 def test_the_arm_stands_when_the_app_is_killed(emulator: UrEmulator) -> None:
-    with subprocess.Popen([sys.executable, "-c", APP, json.dumps(emulator.rig())]) as app:
-        emulator.wait_for(lambda status: max(status["dq"]) > 0.05, 30.0)
-        app.kill()
-    emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 1.0)
+    kill_app(emulator)
     emulator.wait_for(lambda status: not status["program"], 20.0)
 
 
 def test_the_same_program_ends_at_the_same_poses_on_the_arm_and_in_simulation(emulator: UrEmulator) -> None:
     pytest.importorskip("airo_models", reason="needs airo-models: pip install 'robot-hal[robots]'")
-
-    def run(rig: hal.Rig) -> list[Any]:
-        arm, found = rig.robots["arm"], []
-        for change in ([0.2, -0.1, 0.1, 0, 0, 0.3], [-0.2, 0.1, -0.2, 0.2, 0.1, 0], [0.0] * 6):
-            arm.move_to(arm.home + change, unattended=True, speed=0.3)
-            rig.clock.sleep(0.3)
-            found.append(arm.state())
-        return found
-
-    with hal.open(emulator.rig()) as rig:
-        real = run(rig)
-    with hal.open(emulator.rig(), sim=True, clock="lock_step") as rig:
-        simulated = run(rig)
-    off = max(float(np.abs(a.q - b.q).max()) for a, b in zip(real, simulated, strict=True))
-    apart = max(a.tcp.distance(b.tcp)[0] for a, b in zip(real, simulated, strict=True))
-    print(f"{1e3 * apart:.3f} mm, {off:.5f} rad")
-    assert off < 0.003
-    assert apart < 0.001
+    check_same_poses(emulator, [0.2, -0.1, 0.1, 0, 0, 0.3], [-0.2, 0.1, -0.2, 0.2, 0.1, 0])
 
 
 def test_a_lost_state_now_and_then_stops_nothing(emulator: UrEmulator) -> None:

@@ -12,8 +12,8 @@ from waiting import wait_until
 
 import hal
 
+from .network_kit import XArmEmulator
 from .test_ur_faults import find_code, recover, wait_code
-from .xarm_kit import XArmEmulator
 
 pytestmark = [pytest.mark.slow, pytest.mark.pair]
 

@@ -13,24 +13,16 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from waiting import wait_until
 
 import hal
 
+from .network_kit import XArmEmulator, check_same_poses, kill_app
 from .test_ur_faults import recover, wait_code
 from .test_ur_rig import find_children
-from .xarm_kit import XArmEmulator
 
 pytestmark = [pytest.mark.slow, pytest.mark.pair]
-
-APP = """
-import sys, hal, json
-with hal.open(json.loads(sys.argv[1])) as rig, rig.robots["arm"].control(rate_hz=50, unattended=True) as control:
-    for tick in rig.clock.rate(50):
-        control.send(hal.JointVelocity([0, 0, 0, 0.1, 0, 0, 0]))
-"""
 
 
 @pytest.fixture
@@ -112,32 +104,13 @@ def test_the_arm_stands_while_the_host_is_frozen_and_continues_without_a_jump(em
 
 
 def test_the_arm_stands_when_the_app_is_killed(emulator: XArmEmulator) -> None:
-    with subprocess.Popen([sys.executable, "-c", APP, json.dumps(emulator.rig())]) as app:
-        emulator.wait_for(lambda status: max(status["dq"]) > 0.05, 30.0)
-        app.kill()
-    emulator.wait_for(lambda status: max(map(abs, status["dq"])) < 1e-3, 1.0)
+    kill_app(emulator)
     emulator.wait_for(lambda status: status["state"] == 4, 20.0)
     check_stands(emulator)
 
 
 def test_the_same_program_ends_at_the_same_poses_on_the_arm_and_in_simulation(emulator: XArmEmulator) -> None:
-    def run(rig: hal.Rig) -> list[Any]:
-        arm, found = rig.robots["arm"], []
-        for change in ([0.2, -0.1, 0.1, 0.1, 0, 0.3, 0], [-0.2, 0.1, -0.2, 0.2, 0.1, 0, 0.3], [0.0] * 7):
-            arm.move_to(arm.home + change, unattended=True, speed=0.3)
-            rig.clock.sleep(0.3)
-            found.append(arm.state())
-        return found
-
-    with hal.open(emulator.rig()) as rig:
-        real = run(rig)
-    with hal.open(emulator.rig(), sim=True, clock="lock_step") as rig:
-        simulated = run(rig)
-    off = max(float(np.abs(a.q - b.q).max()) for a, b in zip(real, simulated, strict=True))
-    apart = max(a.tcp.distance(b.tcp)[0] for a, b in zip(real, simulated, strict=True))
-    print(f"{1e3 * apart:.3f} mm, {off:.5f} rad")
-    assert off < 0.003
-    assert apart < 0.001
+    check_same_poses(emulator, [0.2, -0.1, 0.1, 0.1, 0, 0.3, 0], [-0.2, 0.1, -0.2, 0.2, 0.1, 0, 0.3])
 
 
 def test_the_gripper_holds_names_its_faults_and_moves_again(emulator: XArmEmulator) -> None:

@@ -22,7 +22,7 @@ from hal.drivers.can.piper_protocol import (
     PiperStatus,
     decode_feedback,
 )
-from hal_emulators.can.console import COMMANDS, execute
+from hal_emulators.can.console import execute
 from hal_emulators.can.damiao import EmulatedDamiaoArm
 from hal_emulators.can.piper import EmulatedPiperArm
 from hal_emulators.can.server import CanEmulator
@@ -127,41 +127,6 @@ def emulator() -> CanEmulator:
     return CanEmulator("openarm", can_overrides("virtual", ("left", "right")))
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "lose 0.5",
-        "lose next 3 2",
-        "late 0.02",
-        "double on",
-        "silent 3 0.2",
-        "silent all on",
-        "cut on",
-        "frame 0x11 00ff 2",
-        "stall 0.1",
-        "status 3 A",
-        "register 2 VMAX 8",
-        "temperature 4 80 90",
-        "power",
-        "masses 1.2",
-        "friction 0",
-        "payload 0.5 0 0 0.1",
-        "place",
-        "push 1 2.0",
-        "object 0.03",
-        "object none",
-        "state",
-        "stats",
-        "stats reset",
-        "reset",
-        "help",
-    ],
-)
-def test_every_command_of_the_console_is_accepted_for_the_arm_that_it_names(emulator: CanEmulator, line: str) -> None:
-    execute(emulator, ["right", *line.split()])
-    assert line.split()[0] in COMMANDS
-
-
 def test_a_command_reaches_the_arm_that_it_names(emulator: CanEmulator) -> None:
     execute(emulator, ["right", "status", "3", "A"])
     left, right = (emulator.arms[name].report()["motors"][3]["status"] for name in ("left", "right"))
@@ -174,30 +139,16 @@ def test_a_command_reaches_the_arm_that_it_names(emulator: CanEmulator) -> None:
     [
         "",
         "frobnicate",
-        "lose",
         "lose 2",
-        "lose next 1 99",
-        "status 99 A",
-        "register 1 NONE 3",
-        "silent",
-        "silent 99 on",
         "silent three on",
         "push 0 2",
-        "push one 2",
-        "place 1 2",
         "place a b c d e f g",
-        "double x",
         "late -1",
-        "masses nan",
         "cut now",
-        "frame 0x900 00",
         "frame 0x11 0g",
         "status 3 Z",
         "status 3 7",
-        "register 3 VMAX fast",
         "register 3 NONE 1",
-        "temperature 3 hot hot",
-        "payload",
         "payload 1 2",
         "object wide",
     ],
