@@ -62,8 +62,13 @@ if (self === top) {
 
 @pytest.fixture(scope="session")
 def iwer(pytestconfig: pytest.Config) -> str:
-    """The emulator's script, from npm; kept for the next run."""
-    folder = Path(pytestconfig.cache.mkdir("iwer"))
+    """The emulator's script."""
+    return load_iwer(Path(pytestconfig.cache.mkdir("iwer")))
+
+
+def load_iwer(folder: Path) -> str:
+    """Return the emulator's script, from npm; it is kept in the folder for the next run."""
+    folder.mkdir(parents=True, exist_ok=True)
     found = folder / f"{IWER.replace('@', '-')}.tgz"
     for _ in range(3):
         if found.exists() or not shutil.which("npm"):

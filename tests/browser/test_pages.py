@@ -8,7 +8,7 @@ from contextlib import closing
 import pytest
 
 from .kit import Bench, Browser, need_browser, wait_for
-from .moves import drive_left, let_go_of_all
+from .moves import BRIEF, drive_left, let_go_of_all, undisturbed
 
 
 @pytest.fixture
@@ -222,13 +222,21 @@ def test_only_buttons_that_do_something_are_shown(page: Browser) -> None:
     assert labels == [], "the default mapping gives no button but the way home a meaning"
 
 
-def test_an_arrow_without_space_shows_what_is_missing(bench: Bench, page: Browser) -> None:
-    wait_for(lambda: page.text("#waiting") == "Stopped. Hold Space to move.", "the advice")
-    page.key("ArrowUp", "ArrowUp", True)
-    wait_for(lambda: "Space too" in page.text("#waiting"), "the hint")
-    assert page.run("return document.querySelector('#waiting').dataset.tone") == "strong"
-    page.key("ArrowUp", "ArrowUp", False)
-    wait_for(lambda: "Space too" not in page.text("#waiting"), "the hint to go")
+def test_a_newcomer_moves_the_arm_by_what_the_page_says(bench: Bench, page: Browser) -> None:
+    """An arrow alone shows which one key is missing; with that one, the arm moves."""
+
+    def try_keys() -> None:
+        wait_for(lambda: page.text("#waiting") == "Stopped. Hold Space to move.", "the advice", BRIEF)
+        page.key("ArrowUp", "ArrowUp", True)
+        wait_for(lambda: "Space too" in page.text("#waiting"), "the hint", BRIEF)
+        assert page.run("return document.querySelector('#waiting').dataset.tone") == "strong"
+        page.hold()
+        wait_for(lambda: bench.tcp_speed[0] > 0.05, "motion", BRIEF)
+        page.let_go()
+        page.key("ArrowUp", "ArrowUp", False)
+        wait_for(lambda: "Space too" not in page.text("#waiting"), "the hint to go", BRIEF)
+
+    undisturbed(bench, page, try_keys)
 
 
 @pytest.mark.parametrize("what", ["a reload", "the end of the tour"])

@@ -60,6 +60,27 @@ def test_the_keys_stay_with_the_page(staged: Browser) -> None:
     wait_for(lambda: staged.run("return document.activeElement === document.body"), "the focus to come back")
 
 
+def test_without_a_gpu_it_stands_still_while_the_dead_man_is_held(bench: Bench, staged: Browser) -> None:
+    """A picture takes longer than the dead-man may be silent for."""
+    staged.run(
+        f"""const view = {FRAME}.contentWindow, loop = () => {{ drawn += 1; view.requestAnimationFrame(loop) }};
+            window.drawn = 0;
+            loop()"""
+    )
+    wait_for(lambda: staged.run("return drawn") > 2, "pictures")
+
+    def hold() -> None:
+        staged.hold()
+        wait_for(lambda: bench.deadman.held, "the dead-man", BRIEF)
+        drawn = staged.run("return drawn")
+        assert staged.run("return new Promise((done) => setTimeout(() => done(drawn), 2500))") == drawn
+        assert bench.deadman.held
+        staged.let_go()
+        wait_for(lambda: staged.run("return drawn") > drawn, "pictures again", BRIEF)
+
+    undisturbed(bench, staged, hold)
+
+
 def drag(bench: Bench, view: PlainPage, way: float) -> None:
     """Drag the gizmo to the left of the tool, m, and release it."""
     tcp = bench.arm.state(max_age=2.0).tcp

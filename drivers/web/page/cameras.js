@@ -199,13 +199,16 @@ function renderer3D() {
   return gl ? String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) : "";
 }
 
+<<<<<<< HEAD
 /** Style that leaves viser's drawing only, on the ground of this page: its panel and its warnings would cover it. */
 const DRAWING = "body { background: none !important; visibility: hidden } canvas { visibility: visible }";
 
+=======
+>>>>>>> 397b492f (Let the 3D view stand still while the dead-man is held and no GPU draws it)
 /** The 3D view, of the rig's own program (drivers/viser). It takes any shape, and opens when it is enlarged. */
 class Stage {
-  /** @param {(name: string) => void} choose */
-  constructor(choose) {
+  /** @param {(name: string) => void} choose @param {() => number} pause ms between two pictures that no GPU draws */
+  constructor(choose, pause) {
     this.name = "3D";
     this.shape = 0;
     this.visible = false;
@@ -224,11 +227,23 @@ class Stage {
     const keep = (/** @type {Event} */ event) => event.preventDefault();
     frame.addEventListener("load", () => {
       for (const type of ["mousedown", "contextmenu", "dragstart"]) frame.contentDocument?.addEventListener(type, keep, true);
+<<<<<<< HEAD
       if (this.opened) frame.contentDocument?.head.append(make("style", "", DRAWING));
+=======
+      if (!this.opened || !this.slow) return;
+      frame.contentDocument?.head.append(make("style", "", "#webgl-software-rendering { display: none }")); // viser's warning
+      const view = /** @type {Window} */ (frame.contentWindow);
+      const ask = view.requestAnimationFrame.bind(view);
+      let drawn = 0; // all that is drawn at one time is one picture
+      view.requestAnimationFrame = (draw) => ask((t) => {
+        if (t !== drawn && t - drawn < pause()) view.requestAnimationFrame(draw);
+        else draw((drawn = t));
+      });
+>>>>>>> 397b492f (Let the 3D view stand still while the dead-man is held and no GPU draws it)
     });
     addEventListener("blur", () => setTimeout(() => document.activeElement === frame && (frame.blur(), focus())));
     const caption = make("figcaption");
-    caption.append(make("b", "", this.slow ? "3D (no GPU: slow)" : "3D"));
+    caption.append(make("b", "", this.slow ? "3D (no GPU: still while you hold)" : "3D"));
     this.figure.append(frame, caption);
     this.figure.addEventListener("click", () => choose(this.name)); // while it is small: its frame takes no pointer then
   }
@@ -247,7 +262,9 @@ class Stage {
 
 /** The panel of the 3D view and of all cameras. */
 export class Cameras {
-  constructor() {
+  /** @param {() => number} pause ms between two pictures of a 3D view that no GPU draws */
+  constructor(pause) {
+    this.pause = pause;
     this.pictures = new Pictures((name) => this.views.find((view) => view.source === name));
     /** @type {View[]} */
     this.views = [];
@@ -284,7 +301,7 @@ export class Cameras {
     this.seen.disconnect();
     const enlarge = (/** @type {string} */ name) => this.#enlarge(name, true);
     this.views = cameras.map((camera) => new View(camera, enlarge, () => this.#watch()));
-    this.stage = staged ? new Stage(enlarge) : null;
+    this.stage = staged ? new Stage(enlarge, this.pause) : null;
     this.shown = this.stage ? [this.stage, ...this.views] : this.views;
     byId("cameras").replaceChildren(...this.shown.map((view) => view.figure));
     const names = this.shown.map((view) => view.name);

@@ -4,9 +4,7 @@ import { PAD_SILENCE } from "./keys.js";
 
 const PERIOD = 20; // ms
 const SOONEST = 6; // ms between two messages for what moves: shorter than the time between two pictures at 120 Hz
-/** Bytes in the browser from which on what waits there is let out first. What was sent in this turn of the browser's
- * loop always waits: counted, a change in the next 20 ms, a release too, would not be sent. */
-const CLOGGED = 4096;
+const CLOGGED = 4096; // bytes that wait in the browser; what this turn of its loop has sent always does
 const STALL = 1000 * PAD_SILENCE; // ms; a page that hangs for longer loses its pad
 
 /**
