@@ -127,6 +127,11 @@ def emulator() -> CanEmulator:
     return CanEmulator("openarm", can_overrides("virtual", ("left", "right")))
 
 
+@pytest.mark.parametrize("line", ["double on", "friction 0", "help", "masses 1.2", "stall 0.1", "stats reset"])
+def test_a_command_without_another_test_is_accepted(emulator: CanEmulator, line: str) -> None:
+    execute(emulator, ["right", *line.split()])
+
+
 def test_a_command_reaches_the_arm_that_it_names(emulator: CanEmulator) -> None:
     execute(emulator, ["right", "status", "3", "A"])
     left, right = (emulator.arms[name].report()["motors"][3]["status"] for name in ("left", "right"))
