@@ -199,12 +199,9 @@ function renderer3D() {
   return gl ? String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) : "";
 }
 
-<<<<<<< HEAD
 /** Style that leaves viser's drawing only, on the ground of this page: its panel and its warnings would cover it. */
 const DRAWING = "body { background: none !important; visibility: hidden } canvas { visibility: visible }";
 
-=======
->>>>>>> 397b492f (Let the 3D view stand still while the dead-man is held and no GPU draws it)
 /** The 3D view, of the rig's own program (drivers/viser). It takes any shape, and opens when it is enlarged. */
 class Stage {
   /** @param {(name: string) => void} choose @param {() => number} pause ms between two pictures that no GPU draws */
@@ -227,11 +224,8 @@ class Stage {
     const keep = (/** @type {Event} */ event) => event.preventDefault();
     frame.addEventListener("load", () => {
       for (const type of ["mousedown", "contextmenu", "dragstart"]) frame.contentDocument?.addEventListener(type, keep, true);
-<<<<<<< HEAD
       if (this.opened) frame.contentDocument?.head.append(make("style", "", DRAWING));
-=======
       if (!this.opened || !this.slow) return;
-      frame.contentDocument?.head.append(make("style", "", "#webgl-software-rendering { display: none }")); // viser's warning
       const view = /** @type {Window} */ (frame.contentWindow);
       const ask = view.requestAnimationFrame.bind(view);
       let drawn = 0; // all that is drawn at one time is one picture
@@ -239,7 +233,6 @@ class Stage {
         if (t !== drawn && t - drawn < pause()) view.requestAnimationFrame(draw);
         else draw((drawn = t));
       });
->>>>>>> 397b492f (Let the 3D view stand still while the dead-man is held and no GPU draws it)
     });
     addEventListener("blur", () => setTimeout(() => document.activeElement === frame && (frame.blur(), focus())));
     const caption = make("figcaption");
