@@ -184,8 +184,7 @@ class View {
 function depthScale([near, far]) {
   const scale = make("span", "scale");
   const colors = [make("i"), make("i")];
-  const listed = DEPTH_COLORS.map((/** @type {number[]} */ color) => `rgb(${color})`);
-  colors[0].style.background = `linear-gradient(to right, ${listed})`;
+  colors[0].style.background = `linear-gradient(to right, ${DEPTH_COLORS.map((/** @type {number[]} */ one) => `rgb(${one})`)})`;
   colors[1].style.background = `rgb(${UNKNOWN_COLOR})`;
   scale.append(`${near}`, colors[0], `${far} m `, colors[1], "unknown");
   scale.title = `${near} to ${far} m in a logarithmic scale, grey is unknown`;
@@ -226,13 +225,10 @@ class Stage {
       for (const type of ["mousedown", "contextmenu", "dragstart"]) frame.contentDocument?.addEventListener(type, keep, true);
       if (this.opened) frame.contentDocument?.head.append(make("style", "", DRAWING));
       if (!this.opened || !this.slow) return;
-      const view = /** @type {Window} */ (frame.contentWindow);
-      const ask = view.requestAnimationFrame.bind(view);
+      const view = /** @type {Window} */ (frame.contentWindow), ask = view.requestAnimationFrame.bind(view);
       let drawn = 0; // all that is drawn at one time is one picture
-      view.requestAnimationFrame = (draw) => ask((t) => {
-        if (t !== drawn && t - drawn < pause()) view.requestAnimationFrame(draw);
-        else draw((drawn = t));
-      });
+      view.requestAnimationFrame = (draw) =>
+        ask((t) => (t !== drawn && t - drawn < pause() ? view.requestAnimationFrame(draw) : draw((drawn = t))));
     });
     addEventListener("blur", () => setTimeout(() => document.activeElement === frame && (frame.blur(), focus())));
     const caption = make("figcaption");

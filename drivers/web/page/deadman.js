@@ -107,9 +107,7 @@ export class Heartbeat {
   #changed(edge) {
     const now = performance.now();
     if (!this.#running || !this.mayDrive() || this.#clogged) return;
-    if (!edge && now - this.#movedAt < SOONEST) return;
-    this.#movedAt = now;
-    this.#send(now);
+    if (edge || now - this.#movedAt >= SOONEST) this.#send((this.#movedAt = now));
   }
 
   /** @param {number} now */
@@ -135,8 +133,7 @@ export class Presence {
     this.came = () => {};
     addEventListener("blur", () => this.session || this.#leave("blur"));
     addEventListener("pagehide", () => this.#leave("closing"));
-    addEventListener("focus", () => this.#update());
-    addEventListener("pageshow", () => this.#update());
+    for (const type of ["focus", "pageshow"]) addEventListener(type, () => this.#update());
     document.addEventListener("freeze", () => this.#leave("hidden"));
     document.addEventListener("visibilitychange", () => this.#update());
   }
