@@ -88,6 +88,8 @@ def hand_latencies(presses: int) -> tuple[list[float], list[float]]:
             watch.start()
             browser.run("window.moved = true; hand.position.x += arguments[0]", (0.05, -0.05)[turn % 2])
             watch.join()
+            if not moved:  # the page hung, and let go
+                continue
             found[0].append(moved[0] - _time_of(browser))
             browser.run("hand.updateButtonValue('squeeze', 0); t0 = performance.timeOrigin + performance.now()")
             wait_for(lambda: bench.speed() == 0.0, "the arm to rest")
