@@ -180,6 +180,9 @@ class Stream:
         """Hold a last target; return the ratio of its time to the optimum, and the overshoot."""
         rng = self.random
         report = self.servo.report
+        while report.status.name == "FOLLOWING" and report.refused == self.seq and not report.trip:
+            self.tick()  # the last act was broken: it is late soon, perhaps in the tick of the next command
+            report = self.servo.report
         while self.servo.report.trip:  # the last act was silence: rearm
             self.tick()
             if not any(self.servo.report.dq_set):

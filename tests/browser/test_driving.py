@@ -148,7 +148,7 @@ def test_release_on_the_way_home_cancels_it(bench: Bench, page: Browser) -> None
         wait_for(lambda: abs(bench.arm.state(max_age=2.0).q - bench.arm.home).max() > 0.2, "the arm to leave home")
     wait_for(bench.rests, "the arm to rest")
     page.click("#home")
-    wait_for(lambda: "homing: hold" in page.text("#log") and bench.speed() > 0.01, "the way home")
+    wait_for(lambda: "Homing: hold" in page.text("#log") and bench.speed() > 0.01, "the way home")
     page.let_go()
     wait_for(lambda: "cancelled" in page.text("#log"), "the app to give it up")
     wait_for(lambda: bench.status == "holding", "the app to drive again")  # a press from before does not count

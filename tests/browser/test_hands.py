@@ -247,7 +247,7 @@ def test_a_browser_that_hangs_though_its_page_does_not(bench: Bench, page: Brows
     assert not held(bench), "what is held since before holds nothing"
     button(page, "mouseReleased", page.place("#hold"), "left", 0)
     let_go_of_all(page)
-    assert "the browser hung" in page.text("#log")
+    assert "The browser hung" in page.text("#log")
     drive_left(bench, page)
     let_go_of_all(page)
 

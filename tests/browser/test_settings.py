@@ -185,7 +185,7 @@ def test_a_reset_stops_first_and_needs_a_new_press(bench: Bench, page: Browser) 
 
     undisturbed(bench, page, move)
     page.click("#reset")
-    wait_for(lambda: "scene reset" in page.text("#log"), "the program to reset the scene")
+    wait_for(lambda: "Scene reset" in page.text("#log"), "the program to reset the scene")
     wait_for(lambda: abs(arm.state(max_age=2.0).q - start).max() < 0.02, "the arm to be where it started")
     time.sleep(0.3)
     assert abs(arm.state(max_age=2.0).q - start).max() < 0.02, "still held, but from before"

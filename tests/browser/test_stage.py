@@ -81,6 +81,20 @@ def test_without_a_gpu_it_stands_still_while_the_dead_man_is_held(bench: Bench, 
     undisturbed(bench, staged, hold)
 
 
+def test_without_a_gpu_it_closes_with_the_connection(staged: Browser) -> None:
+    """Opened again, it would cost the page its connection again where a picture takes seconds."""
+    staged.run(
+        """const send = WebSocket.prototype.send;
+            WebSocket.prototype.send = function (data) {
+              if (!this.url.endsWith('/live')) return send.call(this, data);
+              WebSocket.prototype.send = send;
+              this.close();
+            }"""
+    )
+    wait_for(lambda: staged.run(f"return {FRAME}.getAttribute('src')") is None, "the 3D view to close")
+    wait_for(lambda: staged.run("return document.querySelector('.camera.large canvas') !== null"), "the camera")
+
+
 def drag(bench: Bench, view: PlainPage, way: float) -> None:
     """Drag the gizmo to the left of the tool, m, and release it."""
     tcp = bench.arm.state(max_age=2.0).tcp

@@ -38,7 +38,8 @@ class Bench:
     def run(self, held: tuple[float, float] | None, then: str = "") -> Done:
         """Run the program with a pad whose dead-man is held; execute ``then`` when the fingers move."""
         motor = f"{{id: 7, type: DM4310, kp: 20, kd: 0.5, offset: {OFFSET}}}"
-        overrides = [*self.emulator.overrides, f"robots.arm.gripper.real.motor={motor}"]
+        slow = "robots.arm.rate_hz=100"  # for a busy computer
+        overrides = [*self.emulator.overrides, f"robots.arm.gripper.real.motor={motor}", slow]
         options = [word for value in overrides for word in ("--set", value)]
         pad = write_pad(self.folder, until=60.0, held=held)
         ended = threading.Event()

@@ -203,7 +203,7 @@ const DRAWING = "body { background: none !important; visibility: hidden } canvas
 
 /** The 3D view, of the rig's own program (drivers/viser). It takes any shape, and opens when it is enlarged. */
 class Stage {
-  /** @param {(name: string) => void} choose @param {() => number} pause ms between two pictures that no GPU draws */
+  /** @param {(name: string) => void} choose @param {(took: number) => number} pause see Cameras */
   constructor(choose, pause) {
     this.name = "3D";
     this.shape = 0;
@@ -226,9 +226,13 @@ class Stage {
       if (this.opened) frame.contentDocument?.head.append(make("style", "", DRAWING));
       if (!this.opened || !this.slow) return;
       const view = /** @type {Window} */ (frame.contentWindow), ask = view.requestAnimationFrame.bind(view);
-      let drawn = 0; // all that is drawn at one time is one picture
-      view.requestAnimationFrame = (draw) =>
-        ask((t) => (t !== drawn && t - drawn < pause() ? view.requestAnimationFrame(draw) : draw((drawn = t))));
+      let drawn = -Infinity, last = 0, took = 0; // all that is drawn at one time is one picture
+      view.requestAnimationFrame = (draw) => ask((t) => {
+        if (t !== drawn && last === drawn) took = t - drawn;
+        last = t;
+        if (t !== drawn && t - drawn < pause(took)) view.requestAnimationFrame(draw);
+        else draw((drawn = t));
+      });
     });
     addEventListener("blur", () => setTimeout(() => document.activeElement === frame && (frame.blur(), focus())));
     const caption = make("figcaption");
@@ -242,16 +246,22 @@ class Stage {
     if (this.frame.getAttribute("src") !== this.address) this.frame.src = this.address;
   }
 
-  /** @param {string} address */
+  /** @param {string} address @returns {boolean} whether it closed: drawn without a GPU, it may have cost the connection */
   move(address) {
+    const closes = this.opened && this.slow && address !== this.address;
     this.address = address;
-    if (this.opened) this.open();
+    if (closes) {
+      this.opened = false;
+      this.frame.contentWindow?.location.replace("about:blank");
+      this.frame.removeAttribute("src");
+    } else if (this.opened) this.open();
+    return closes;
   }
 }
 
 /** The panel of the 3D view and of all cameras. */
 export class Cameras {
-  /** @param {() => number} pause ms between two pictures of a 3D view that no GPU draws */
+  /** @param {(took: number) => number} pause ms from a picture of a 3D view without a GPU to the next; it took so long */
   constructor(pause) {
     this.pause = pause;
     this.pictures = new Pictures((name) => this.views.find((view) => view.source === name));
@@ -273,7 +283,7 @@ export class Cameras {
     const all = JSON.stringify([stage !== "", cameras]);
     if (this.#built !== all) this.#build(cameras, stage !== "" && renderer3D() !== "");
     this.#built = all;
-    this.stage?.move(stage);
+    if (this.stage?.move(stage)) this.#enlarge(this.shown[this.views.length ? 1 : 0].name, false);
     this.pictures.open(cameras.flatMap((camera) => Object.values(camera.streams)));
   }
 

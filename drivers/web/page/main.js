@@ -26,7 +26,8 @@ const heartbeat = new Heartbeat(pad, connection, () => lease.mine && connection.
 const log = new Log();
 const status = new Status(connection, lease);
 const panel = new ArmPanel();
-const cameras = new Cameras(() => (pad.held ? Infinity : lease.mine ? 2000 : 0)); // each picture stalls this page
+// Each picture of the 3D view stalls this page: a press must be possible in between.
+const cameras = new Cameras((took) => (pad.held ? Infinity : lease.mine ? Math.max(2000, 10 * took) : 0));
 const recording = new Recording(connection, lease);
 const settings = new Settings(connection, lease, panel, () => pad.held, (text) => status.notice(text));
 const overlay = new Overlay(() => connection.open());
